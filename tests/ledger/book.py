@@ -14,7 +14,7 @@ import numpy as np
 FILE = Path(__file__).with_name("figures.txt")
 COLUMNS = ("4", "20", "80", "auto", "late")  # substeps; "late": 20 in frames of uneven length, some of a quarter of a second
 HEAD = f"# Written by `python -m tests.ledger --write`. Columns: {', '.join(COLUMNS)}; see runs.py.\n"
-SHARE = 0.05  # by which a figure may be worse without being told: a tenth shows in print, and half of that is two lines of noise
+SHARE = 0.05  # by which a figure may be worse without being told: more than its last digit of three, less than a user would see
 NONE = "-"
 
 Key = tuple[str, str, str]  # scene, how it is solved, figure

@@ -23,7 +23,7 @@ from tiverlet.step.span import MOST
 
 from ..fuzz import oracles
 from ..fuzz.scenes import Set, Step, Structure
-from ..fuzz.trials import Refused, Trial, quiet
+from ..fuzz.trials import Trial, quiet
 from ..launches import launches, launching
 from ..scenes import SCENES
 from ..scenes.scene import Scene
@@ -160,10 +160,7 @@ def of_scene(scene: Scene) -> Iterator[Cell]:
             for column in COLUMNS:
                 if column == "auto" and method != "default":
                     continue
-                try:
-                    seen, x = played(trial, scene, method, column)
-                except Refused:
-                    continue
+                seen, x = played(trial, scene, method, column)
                 yield from seen_in(trial, how, column, seen, ROUNDING[precision])
                 if end is not None and column != "late":
                     size = float(np.abs(end - trial.structure.position).max())

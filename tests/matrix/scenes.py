@@ -71,6 +71,16 @@ def links():
     return c.Particles(x, pinned=pairs[:, 0], radius=0.02), [c.Gravity(G), link], promises
 
 
+def thrown(of: str) -> list[Promise]:
+    """Return promises of what falls on four of a kind, from pairs of particles: rigid, soft, soft and damped, weak."""
+    return [
+        kept(of, "compliance", says="a soft one throws back", figure=lambda r: r.v[:, 3, 1].max(), least=1.0),
+        kept(of, "damping", says="a damped one does so less",
+             figure=lambda r: r.v[:, 5, 1].max() - r.v[:, 3, 1].max(), most=-0.5),
+        weak(of, 1, 3),
+    ]  # fmt: skip
+
+
 @scene(frames=30)
 def ropes():
     # What falls by 0.3 m has 2.4 m/s when its rope is taut: v sqrt(m k) = 77 N on a spring of 1000 N/m.
@@ -80,10 +90,7 @@ def ropes():
         kept("Rope", "pairs", "length", says="a rope is as long as given at most",
              figure=lambda r: r.length(0).max(), most=0.801),
         kept("Rope", "pairs", says="it bears what hangs on it", figure=lambda r: r.loads[1][-1, 0], least=9.7, most=9.9),
-        kept("Rope", "compliance", says="a soft rope throws back", figure=lambda r: r.v[:, 3, 1].max(), least=1.0),
-        kept("Rope", "damping", says="a damped one does so less",
-             figure=lambda r: r.v[:, 5, 1].max() - r.v[:, 3, 1].max(), most=-0.5),
-        weak("Rope", 1, 3),
+        *thrown("Rope"),
     ]  # fmt: skip
     return c.Particles(x, pinned=pairs[:, 0], radius=0.02), [c.Gravity(G), rope], promises
 
@@ -95,10 +102,7 @@ def spacers():
     promises = [
         kept("Spacer", "pairs", "length", says="what falls is held off", figure=lambda r: r.length(0).min(), least=0.699),
         kept("Spacer", "pairs", says="and presses", figure=lambda r: r.loads[1][-1, 0], least=-9.9, most=-9.7),
-        kept("Spacer", "compliance", says="a soft one throws back", figure=lambda r: r.v[:, 3, 1].max(), least=1.0),
-        kept("Spacer", "damping", says="a damped one does so less",
-             figure=lambda r: r.v[:, 5, 1].max() - r.v[:, 3, 1].max(), most=-0.5),
-        weak("Spacer", 1, 3),
+        *thrown("Spacer"),
     ]  # fmt: skip
     return c.Particles(x, pinned=pairs[:, 0], radius=0.02), [c.Gravity(G), spacer], promises
 

@@ -49,8 +49,8 @@ class Rows:
     particle is divided.
     Columns by row: `other` the other particle, or WALL + the face of a wall; `entry` in the neighbour list; `normal`; `gap` at
     the start of the substep where it was open [m]; `bend` the curvature of the gap [1/m]; `stiff` the effective mass in a pass of
-    impulses, along the normal and across it, and `firm` in one of places [kg]; `friction` see bound_friction(); `moved` how far
-    a wall moved in the substep [m]; `p` the impulse and `step` its change in the last pass [kg m].
+    impulses, along the normal and across it, and `firm` in one of places [kg]; `friction` static and dynamic; `moved` the motion
+    of a wall in the substep [m]; `p` the impulse and `step` its change in the last pass [kg m].
     The normal is that at the start of the substep, or that of the time at which a pair meets.
     """
 
@@ -89,7 +89,7 @@ class Rows:
         self.friction: Any = self.column("friction", 2) if has_friction else None
         number = scene.memory.number
         self.push_out, self.ahead = number(-1.0 if push_out is None else push_out, scene.real), number(ahead, scene.real)
-        # Whether a pair slid in the last substep, see bound_friction().
+        # Whether a pair slid in the last substep, where static and dynamic friction differ, see bound_friction().
         self.slid: Any = PairData("slides", 0, persistent=True, kind=ti.i32, has_owner=not edges) if has_friction else None
         self.bounces, self.rounding = bounces, NOISE * (2.0**-52 if scene.real == ti.f64 else 2.0**-23)
         self.touched: Any = None
@@ -373,25 +373,21 @@ class Rows:
 
         What stuck at the end of the last substep is held by static friction; what slid is braked by dynamic friction, and held by
         static friction once its slip has vanished. What comes to touch slides where its slip is more than forces make of it.
-        `friction` is static and dynamic where it sticks, dynamic and minus static where it slides.
         slip: across the normal at the start of the passes. slight: by how much forces move its particles [m].
         """
-        f, e = self.friction.field[row], self.entry.field[row]
-        if f[1] < f[0]:
-            slides = self.slid.field[e] != 0
-            if not self.is_set(self.memory.field[e]):
-                slides = slip.norm() > ti.static(SLOW) * slight
-            if slides:
-                self.friction.field[row] = [f[1], -f[0]]
+        e = self.entry.field[row]
+        if not self.is_set(self.memory.field[e]):
+            self.slid.field[e] = ti.cast(slip.norm() > ti.static(SLOW) * slight, ti.i32)
 
     @ti.func
     def friction_bound(self, row, across, n):
         """Return the coefficient of friction of a row whose impulse across the normal n is `across`."""
         f = self.friction.field[row]
         out = f[0]
-        if f[1] < 0:
-            if across.dot(self.braking(row, n)) < 0:  # it brakes no more, but holds
-                out = -f[1]
+        if f[1] < f[0]:
+            if self.slid.field[self.entry.field[row]] != 0:
+                if not across.dot(self.braking(row, n)) < 0:  # else it brakes no more, but holds
+                    out = f[1]
         return out
 
     @ti.func
@@ -406,13 +402,13 @@ class Rows:
 
         p: its impulse, with those of impacts in turn. slip, slight: as in bound_friction(), at the end.
         """
-        f, load = self.friction.field[row], p.dot(n)
+        e, load = self.entry.field[row], p.dot(n)
         across = p - load * n
         bound = self.friction_bound(row, across, n)
-        brakes = f[1] < 0 and bound == f[0]
+        brakes = self.slid.field[e] != 0 and bound < self.friction.field[row][0]
         full = load > 0 and across.norm() >= (1 - ti.static(FULL)) * bound * load
         slides = full and (brakes or slip.norm() > ti.static(SLIPS) * slight)
-        self.slid.field[self.entry.field[row]] = ti.cast(slides, ti.i32)
+        self.slid.field[e] = ti.cast(slides, ti.i32)
 
     @ti.func
     def work_of_others(self, i):

@@ -19,6 +19,7 @@ NAMES = {
 RATE = 16  # frames in a row that are another rate: a quarter of a second at 60 a second
 OTHER = 1.5  # times as long, or as short, as the frames so far: one of another rate, if it is not alone
 LATE = 8  # times as many substeps as were set, at most, in a frame that is late: a stalled program must not stall for more
+EQUAL = 2.0**-50  # substeps that differ by less, relatively, are of one length: 1 / 60 / 20 and 1 / 30 / 40
 SHARE = 0.1  # of the largest kinetic energy: the gain, or the loss, that is allowed
 DIGITS = 1e-5  # of the energy: the gain, or the loss, that rounding may cause
 CHANGED = -np.inf  # the bound while work is done on the scene in the coming frame: earlier energies do not count
@@ -27,6 +28,11 @@ MET = 1e-6  # relative violation that counts as rounding
 PARTED = 0.01  # overlap [radii] down to which particles placed into each other push themselves apart
 PACE = 3  # values of a Pace, which say nothing of the present state
 NO, YES, UNKNOWN = range(3)  # whether a scene conserves energy
+
+
+def is_as_long(h: Any, last: Any) -> Any:
+    """Whether substeps of h and of `last` [s] are of one length but for rounding. Numbers or arrays."""
+    return abs(h - last) <= EQUAL * h
 
 
 def energy_limit(bound: Any, kinetic: Any, energy: Any) -> Any:

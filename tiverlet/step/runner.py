@@ -14,7 +14,7 @@ from ..device.memory import Rows, numbers_of
 from ..device.patches.compiler import CachedLaunch
 from ..particles.spin import moments_of_inertia
 from . import high_order, settling, softness, violations
-from .clock import Clock, initial_margin
+from .clock import Clock, initial_margin, is_as_long
 from .diagnostics import BARE, EXTENT, STARTED, STEPPED, UNSTEPPED
 from .frames import Frames
 from .impulse import factor_of
@@ -25,7 +25,6 @@ from .step import frame
 from .step_report import StepReport
 
 NONE = np.zeros(0, dtype=np.int64)
-EQUAL = 2.0**-50  # substeps that differ by less, relatively, are of one length: 1 / 60 / 20 and 1 / 30 / 40
 KEPT = 100_000  # particles up to which the array for velocities is kept; above, allocating it costs next to nothing
 LONG = 10_000_000  # (particles + constraints) x passes in one launch at most: it takes about a second
 
@@ -192,7 +191,7 @@ class Runner:
     def length(self, dt: float, substeps: int) -> float:
         """Return the length of a substep in a frame of dt [s]: the last one, where they differ by rounding alone."""
         h, last = dt / substeps * self.integrator.first, self.clock.h
-        return last if abs(h - last) <= EQUAL * h else h
+        return last if is_as_long(h, last) else h
 
     def _relieves(self, h: float, dt: float, keeps: bool, adapts: bool) -> bool:
         """Whether what longer substeps have left settles before substeps h [s].

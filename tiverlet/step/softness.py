@@ -6,7 +6,7 @@ and its energy (h / h')^2 times as large. So stiffness is state: links are as so
 
     s = (longest / h)^2
 
-and nothing has to move. Substeps keep their length from frame to frame, to rounding of their number (see adaptive.py); so where
+and nothing has to move. Substeps keep their length from frame to frame, to rounding of their number (Pace in clock.py); so where
 frames are uneven, links are always as soft as in the longest substep so far, and a net rests in one place. Where the user sets
 another number of substeps, "auto" does, or after a frame that was far too late, s is larger at first, and approaches that by
 (s - 1)' = -(s - 1) / SETTLE, which lifts what sags. So a frame adds a share dt / SETTLE of the energy that violations store, but

@@ -19,10 +19,9 @@ from ..features.read_only import assign_whole_advice, read_only
 from ..features.unknown_names import answer_names, suggest
 from ..step import checkpoint, energy_bound, impulse
 from ..step import frames as kernel
-from ..step.clock import CHANGED, energy_floor, energy_limit, exceeds, falls_short, initial_margin
+from ..step.clock import CHANGED, energy_floor, energy_limit, exceeds, falls_short, initial_margin, is_as_long
 from ..step.diagnostics import ENERGY, EXTENT, KINETIC, OVERLAP, STARTED, STEPPED, TURNS, UNSTEPPED, risks
 from ..step.integrator import shares_of
-from ..step.runner import EQUAL
 from ..world import World
 from .clocks import NONE, Clocks
 from .knobs import Knobs
@@ -209,7 +208,7 @@ class Worlds:
             clocks.needs_drag |= self._knobs.has_changed(drag)
         self._upload()
         h = dt / substeps * runner.integrator.first
-        ready = (clocks.first_moved == NONE) & (np.abs(clocks.h - h) <= EQUAL * h) & ~clocks.needs_drag
+        ready = (clocks.first_moved == NONE) & is_as_long(h, clocks.h) & ~clocks.needs_drag
         ready &= (clocks.softest == 1) & (clocks.iterations == world.iterations)
         moved, released, jumped = np.zeros(len(self)), np.zeros(len(self)), np.zeros(len(self), dtype=bool)
         some = np.flatnonzero(~ready)
