@@ -25,8 +25,8 @@ CONVERGED = 1e-2  # of r . z at the start of an iteration: what may be left at i
 NULL = 8  # rounding errors of d . W d: if d . A d is below that, or below REDUNDANT, direction d is in the null space of A
 BLOCKS = 64  # partial sums: a fixed number, so that totals are the same bit for bit on any number of threads
 # Indices into `sums`: r . z; the length of the step, later the weight of the old direction in the next one; the length of a step
-# that is taken back; r . z at the start of the iteration.
-RZ, FACTOR, TAKEN_BACK, RZ_START = range(4)
+# that is taken back; r . z at the start of the iteration; 1 if multipliers are limited to what the substep can stand.
+RZ, FACTOR, TAKEN_BACK, RZ_START, LIMITED = range(5)
 
 
 class ConjugateGradient(Solver):
@@ -111,7 +111,7 @@ class CGSystem(System):
         self.partial, self.worst = self.reals("partial_sums", BLOCKS), self.reals("worst", BLOCKS)
         if self.limits_steps:
             self.gain, self.too_long = self.reals("gain", BLOCKS), self.reals("over", BLOCKS)
-        self.sums = scene.memory.field("system.sums", None, width=4, kind=ti.f64)
+        self.sums = scene.memory.field("system.sums", None, width=5, kind=ti.f64)
         self.noise, self.above_noise = self.reals("noise"), self.reals("loud", BLOCKS)  # r z of rounding; 1 if a row is above it
         self.null = max(REDUNDANT, NULL * self.epsilon)
         self.rounding = self.epsilon ** (2 if scene.state.compensated else 1)  # of positions
@@ -215,7 +215,7 @@ class CGSystem(System):
         ti.loop_config(serialize=True)
         for _ in range(self.team.one(1, thread)):
             now = self.sum_partials()
-            self.sums[None] = ti.Vector([now, 0, 0, now], ti.f64)
+            self.sums[None] = ti.Vector([now, 0, 0, now, 0], ti.f64)
         self.team.wait()
 
     @ti.func
@@ -237,7 +237,7 @@ class CGSystem(System):
 
     @ti.func
     def iterate(self, thread):
-        """Take one step of conjugate gradients. If it needs too large a tension, it is taken back, and no step follows."""
+        """Take one step of conjugate gradients. If it needs too large a tension, rows bear what they can, and no step follows."""
         self.compute_moves(thread)
         self.compute_step_length(thread)
         self.apply_step(thread)
@@ -324,26 +324,31 @@ class CGSystem(System):
             for b in range(1, BLOCKS):
                 worst = ti.max(worst, self.worst[b])
             ti.atomic_max(self.tension[None], worst)
+            back, limited = 0 * now, ti.select(worst > TENSEST, 1 + 0 * now, 0 * now)
             if ti.static(self.limits_steps):
                 gain, over = self.gain[0], self.too_long[0]
                 for b in range(1, BLOCKS):
                     gain += self.gain[b]
                     over += self.too_long[b]
-                if gain > 0 and over > 0:  # as in Elimination.limit_steps(): such a step is taken back, too
-                    worst = 2 * TENSEST
-            back = ti.select(worst > TENSEST, self.sums[None][FACTOR], 0 * now)
-            if worst > TENSEST:
+                if gain > 0 and over > 0:  # as in Elimination.limit_steps(): such a step is taken back
+                    back = self.sums[None][FACTOR]
+            if back != 0 or limited != 0:
                 now = 0
             first = self.sums[None][RZ_START]
-            self.sums[None] = ti.Vector([now, ti.select(before > 0, now / before, 0 * now), back, first], ti.f64)
+            self.sums[None] = ti.Vector([now, ti.select(before > 0, now / before, 0 * now), back, first, limited], ti.f64)
         self.team.wait()
 
     @ti.func
     def update_direction(self, thread):
-        """Take a step back that was too long, and compute the next direction, z + (r . z / r . z before) d."""
+        """Take a step back that was too long, limit tensions, and compute the next direction, z + (r . z / r . z before) d."""
         for r in range(self.team.chunk_begin(self.rows, thread), self.team.chunk_end(self.rows, thread)):
             if self.sums[None][TAKEN_BACK] != 0:
                 self.step[r] = self.step[r] - self.sums[None][TAKEN_BACK] * self.direction[r]
+                self.residual[r] = 0
+            if self.sums[None][LIMITED] != 0:
+                if self.geometric_stiffness[r] > 0:
+                    most = TENSEST / self.geometric_stiffness[r]
+                    self.step[r] = ti.max(-most, ti.min(most, self.lam[r] + self.step[r])) - self.lam[r]
                 self.residual[r] = 0
             self.direction[r] = (
                 self.inverse_diagonal[r] * self.residual[r] + ti.cast(self.sums[None][FACTOR], self.real) * self.direction[r]

@@ -24,7 +24,7 @@ CONTRADICTION = 1e-6  # of its violation: a redundant constraint with a smaller 
 SMALL_PIVOT = 2e-3  # of the contribution of its heaviest particle: below, a load is hardly borne to first order
 AGREEMENT = 0.25  # of the tension: how far solutions with directions at the two ends of the substep may differ there
 STABLE = 2.0  # (omega h)^2 that is allowed there: half the limit of stability
-ROUNDS = 8  # at most, in search of the ropes that pull, and of the softness of a system
+ROUNDS = 24  # at most, in search of the rows that are at bounds
 
 # A system takes a second Newton step if a particle moved by more than the square root of LONG_MOVE, in lengths, unless a tension
 # was above CALM_TENSION, (omega h)^2. Such vibrations are not resolved and gain energy; the error of the first step removes it.
@@ -143,8 +143,7 @@ class Elimination(System):
         product[:, 1:] = slot[product[:, 1:]]
         side = np.repeat([b.side for b in scalars], [b.count for b in scalars])[rows]
         bounded = [np.isfinite(b.course()[2]) if b.driven else np.zeros(b.count, dtype=bool) for b in scalars]
-        limited = (side != 0) | np.concatenate(bounded)[rows]
-        self.bounds = bool(limited.any())
+        self.bounds = bool(((side != 0) | np.concatenate(bounded)[rows]).any())
         ints, reals = self.ints, self.reals
         self.part_begin, self.column, self.update = (ints(k, getattr(found, k)) for k in ("part_begin", "column", "update"))
         self.entry_begin, self.product_begin = ints("entry_begin", found.entry_begin), ints("product_begin", found.product_begin)
@@ -169,7 +168,8 @@ class Elimination(System):
             self.added, self.turned_to = reals("added", found.parts), reals("turned_to", found.parts)
         who = np.zeros(slots.total, dtype=np.int64)
         who[corner] = particle
-        self.particle_of, self.w, self.inverse_size = ints("who", who), scene.state.w, reals("close")
+        self.particle_of, self.w = ints("who", who), scene.state.w
+        self.inverse_size = reals("close", values=np.concatenate([b.inverse_size(b.start.position) for b in scalars])[rows])
         self.refines = scene.order == 2 and not (self.limits_steps or self.has_shared_particles)
         self.part_of = ints("part_of", self._part)
         near = np.zeros(len(scene.inv_mass))
@@ -195,11 +195,13 @@ class Elimination(System):
             batch = np.repeat(np.arange(len(scalars)), [b.count for b in scalars])[rows]
             number = np.concatenate([np.arange(b.count) for b in scalars])[rows]
             self.batch, self.number = ints("batch", batch), ints("number", number)
-        if self.bounds:  # of multipliers; bound: that of a row which is at one
-            self.limited, self.active, self.remaining = ints("limited", limited), ints("active", 0 * side), reals("left")
+        # bound: that of a row which is at one, where active is 0. yield_load: the largest multiplier while the part gives way.
+        # remaining: the change of violations by the steps.
+        self.active, self.bound, self.remaining = ints("active", 0 * side), reals("bound"), reals("left")
+        self.yield_load = reals("yield_load")
+        if self.bounds:
             self.low = reals("low", values=np.where(side < 0, 0.0, -np.inf))
             self.high = reals("high", values=np.where(side > 0, 0.0, np.inf))
-            self.bound = reals("bound")
 
     def keep_softness(self, ratio: float) -> None:
         """Keep parts that give way as soft as they are, where the next substep is `ratio` times as long as the last one."""
@@ -248,12 +250,16 @@ class Elimination(System):
     def set_row(self, r, violation, A, alpha, lam, W, geometric_stiffness):
         """Set the data of row r for this pass, see System.set_row(), and whether a one-sided row is active."""
         System.set_row(self, r, violation, A, alpha, lam, W, geometric_stiffness)
-        if W > 0:
-            self.inverse_size[r] = geometric_stiffness / (2 * W)
-        if ti.static(self.bounds):
-            self.bound[r] = ti.select(W > 0, ti.max(self.low[r], ti.min(self.high[r], self.lam[r])), 0 * self.lam[r])
-            acts = self.is_inside(r, self.lam[r]) or self.leaves_bound(r, self.lam[r], self.violation[r])
-            self.active[r] = ti.cast(W > 0 and acts, ti.i32)
+        self.yield_load[r] = ti.math.inf
+        self.begin_row(r)
+
+    @ti.func
+    def begin_row(self, r):
+        """Begin an active set: row r is active unless it is at a bound and needs no other multiplier."""
+        low, high = self.bounds_of(r)
+        self.bound[r] = ti.select(self.scale[r] != 0, ti.max(low, ti.min(high, self.lam[r])), 0 * self.lam[r])
+        acts = self.is_inside(r, self.lam[r]) or self.leaves_bound(r, self.lam[r], self.violation[r])
+        self.active[r] = ti.cast(self.scale[r] != 0 and acts, ti.i32)
 
     @ti.func
     def bound_row(self, r, low, high):
@@ -262,19 +268,36 @@ class Elimination(System):
             self.low[r], self.high[r] = low, high
 
     @ti.func
+    def bounds_of(self, r):
+        """Return the least and the largest multiplier of row r."""
+        low, high = -self.yield_load[r], self.yield_load[r]
+        if ti.static(self.bounds):
+            low, high = ti.max(low, ti.min(self.low[r], high)), ti.min(high, ti.max(self.high[r], low))
+        return low, high
+
+    @ti.func
+    def is_limited(self, r):
+        """Whether the multiplier of row r has a bound."""
+        low, high = self.bounds_of(r)
+        return low > -ti.math.inf or high < ti.math.inf
+
+    @ti.func
     def is_inside(self, r, lam):
         """Whether a multiplier of row r is within its bounds."""
-        return self.low[r] < lam and lam < self.high[r]
+        low, high = self.bounds_of(r)
+        return low < lam and lam < high
 
     @ti.func
     def leaves_bound(self, r, lam, violation):
         """Whether row r, whose multiplier is at a bound, needs another one for such a violation."""
-        return self.low[r] < self.high[r] and ((lam >= self.high[r] and violation > 0) or (lam <= self.low[r] and violation < 0))
+        low, high = self.bounds_of(r)
+        return low < high and ((lam >= high and violation > 0) or (lam <= low and violation < 0))
 
     @ti.func
     def nearest_bound(self, r, lam):
         """Return the bound of row r that a multiplier is beyond."""
-        return ti.select(lam >= self.high[r], self.high[r], self.low[r])
+        low, high = self.bounds_of(r)
+        return ti.select(lam >= high, high, low)
 
     @ti.func
     def set_gradient(self, place, i, gradient):
@@ -287,12 +310,12 @@ class Elimination(System):
     @inline
     def is_active(self, r):
         """Whether row r takes part in the system."""
-        return at(self.active if self.bounds else self.scale, r) != 0
+        return at(self.active, r) != 0
 
     @called
     @ti.func
     def assemble(self, begin: ti.i32, end: ti.i32, softness: ti.f64, at_end: ti.i32):
-        """Assemble the matrix and right side of rows from `begin` up to `end`. Rows that do not act get the multiplier 0.
+        """Assemble the matrix and right side of rows from `begin` up to `end`. Rows that do not act get their bound.
 
         softness: added to the diagonal. at_end: whether directions are those at the end of the substep.
         """
@@ -313,9 +336,7 @@ class Elimination(System):
                 self.step[r] = -self.violation[r]
             else:
                 self.value[r] = 1
-                self.step[r] = -self.lam[r]
-                if ti.static(self.bounds):
-                    self.step[r] = self.bound[r] - self.lam[r]
+                self.step[r] = self.bound[r] - self.lam[r]
             self.diagonal[r] = self.value[r]
 
     @called
@@ -406,9 +427,8 @@ class Elimination(System):
     def bears(self, r):
         """Whether row r is met by its multiplier: it is not slack, and its part does not give way."""
         out = self.alpha[r] == 0 and self.is_active(r) and self.added[self.part_of[r]] == 0 and self.diagonal[r] != 0
-        if ti.static(self.bounds):
-            if self.limited[r] != 0:
-                out = out and self.is_inside(r, self.solution[r] + self.answer[r])
+        if self.is_limited(r):
+            out = out and self.is_inside(r, self.solution[r] + self.answer[r])
         return out
 
     @ti.func
@@ -427,9 +447,8 @@ class Elimination(System):
         self.bends_far[b] = 0
         for r in range(self.part_begin[b], self.part_begin[b + 1]):
             self.answer[r], self.solution[r], self.gap[r] = 0, self.lam[r] + self.step[r], 0
-            if ti.static(self.bounds):
-                if self.limited[r] != 0:
-                    self.gap[r] = self.violation[r] + self.remaining[r] + self.alpha[r] * self.step[r]
+            if self.is_limited(r):
+                self.gap[r] = self.violation[r] + self.remaining[r] + self.alpha[r] * self.step[r]
         if self.added[b] > 0:
             self.assemble(self.part_begin[b], self.part_begin[b + 1], self.added[b], 0)
             self.eliminate(self.part_begin[b], self.part_begin[b + 1])
@@ -463,15 +482,14 @@ class Elimination(System):
             self.joined.begin_answer(b, self, moved, d)
         for r in range(begin, end):
             change = -self.scale[r] * self.moved_along(r, moved, d, True) - self.gap[r]
-            if ti.static(self.bounds):
-                if self.limited[r] != 0 and self.scale[r] != 0:
-                    lam = self.solution[r] + self.answer[r]
-                    acts = ti.select(self.active[r] != 0, self.is_inside(r, lam), self.leaves_bound(r, lam, -change))
-                    if acts != (self.active[r] != 0):
-                        self.active[r], switched = 1 - self.active[r], True
-                        if not acts:
-                            self.bound[r] = self.nearest_bound(r, lam)
-                            self.answer[r] = self.bound[r] - self.solution[r]
+            if self.is_limited(r) and self.scale[r] != 0:
+                lam = self.solution[r] + self.answer[r]
+                acts = ti.select(self.active[r] != 0, self.is_inside(r, lam), self.leaves_bound(r, lam, -change))
+                if acts != (self.active[r] != 0):
+                    self.active[r], switched = 1 - self.active[r], True
+                    if not acts:
+                        self.bound[r] = self.nearest_bound(r, lam)
+                        self.answer[r] = self.bound[r] - self.solution[r]
             if self.is_active(r):
                 change -= (self.alpha[r] + self.added[b]) * self.answer[r]
             else:
@@ -504,8 +522,8 @@ class Elimination(System):
         """End the answers of part b to moves of its particles, `moved` - d. Those to places remove what earlier ones left."""
         for r in range(self.part_begin[b], self.part_begin[b + 1]):
             gap = self.scale[r] * self.left[r]
-            if ti.static(self.bounds):
-                if self.limited[r] != 0 and self.active[r] == 0:
+            if self.is_limited(r):
+                if self.active[r] == 0:
                     gap += self.gap[r] + self.scale[r] * self.moved_along(r, moved, d, False)
                 self.solution[r] = self.solution[r] + self.answer[r]
             self.gap[r], self.answer[r] = gap, 0
@@ -556,7 +574,7 @@ class Elimination(System):
             for q in range(self.product_begin[r], self.product_begin[r + 1]):
                 at = self.product[q]
                 self.remaining[r] = self.remaining[r] + self.scale[r] * self.coupling(at, at_end) * self.step[self.row_of[at[2]]]
-            if self.limited[r] != 0 and self.scale[r] != 0:
+            if self.is_limited(r) and self.scale[r] != 0:
                 new = self.lam[r] + self.step[r]
                 left = self.violation[r] + self.remaining[r] + self.alpha[r] * self.step[r]
                 acts = ti.select(self.active[r] != 0, self.is_inside(r, new), self.leaves_bound(r, self.bound[r], left))
@@ -567,22 +585,21 @@ class Elimination(System):
         return changed
 
     @ti.func
-    def solve_active_set(self, begin, end, softness, at_end):
+    def solve_active_set(self, begin, end, softness, at_end, gives_way):
         """Find the steps of all rows that act, by an active set. Returns the result of eliminate()."""
-        hard = 0
-        if ti.static(self.bounds):
-            k = 0
-            while k < ROUNDS:
-                self.assemble(begin, end, softness, at_end)
-                found = self.eliminate(begin, end)
-                hard = ti.max(found, ti.select(hard == 2, 2, 0))  # a contradiction is kept: its row may be switched off next
-                k = ti.select(self.update_active_set(begin, end, at_end) != 0, k + 1, ROUNDS)
-            for r in range(begin, end):
-                if self.limited[r] != 0 and self.scale[r] != 0:
-                    self.step[r] = ti.max(self.low[r], ti.min(self.high[r], self.lam[r] + self.step[r])) - self.lam[r]
-        else:
+        hard, k, bounded = 0, 0, gives_way or ti.static(self.bounds)
+        while k < ROUNDS:
             self.assemble(begin, end, softness, at_end)
-            hard = self.eliminate(begin, end)
+            found = self.eliminate(begin, end)
+            hard = ti.max(found, ti.select(hard == 2, 2, 0))  # a contradiction is kept: its row may be switched off next
+            k += 1
+            if not bounded or self.update_active_set(begin, end, at_end) == 0:
+                k = ROUNDS
+        if bounded:
+            for r in range(begin, end):
+                if self.scale[r] != 0:
+                    low, high = self.bounds_of(r)
+                    self.step[r] = ti.max(low, ti.min(high, self.lam[r] + self.step[r])) - self.lam[r]
         return hard
 
     @ti.func
@@ -601,8 +618,7 @@ class Elimination(System):
             for r in range(begin, end):
                 if self.trusted_step[r] < ti.math.inf and self.scale[r] != 0:
                     self.scale[r], self.lam[r], self.geometric_stiffness[r], found = 0, self.own_step[r], 0, 1
-                    if ti.static(self.bounds):
-                        self.active[r], self.bound[r] = 0, 0
+                    self.active[r], self.bound[r] = 0, 0
         return found
 
     @ti.func
@@ -615,23 +631,18 @@ class Elimination(System):
 
     @ti.func
     def tensions(self, begin, end, at_end, longer):
-        """Return (omega h)^2 of transverse vibrations under the multipliers found: the largest, and the signed sum.
+        """Return (omega h)^2 of transverse vibrations under the multipliers found: by pull or pressure, by pull, the signed sum.
 
-        longer: the square of the substep for which they are computed, relative to the present one. Also returned are the ratio of
-        violations to steps, which is the mean stiffness of the system, and the largest diagonal.
+        Pull makes particles vibrate, pressure lets them buckle. longer: the square of the substep for which they are computed,
+        relative to the present one.
         """
-        worst, total = ti.cast(0, ti.f64), ti.cast(0, ti.f64)
-        size, steps, most = ti.cast(0, ti.f64), ti.cast(0, ti.f64), ti.cast(0, ti.f64)
+        worst, pull, total = ti.cast(0, ti.f64), ti.cast(0, ti.f64), ti.cast(0, ti.f64)
         for r in range(begin, end):
-            step, geometric_stiffness = self.step[r], longer * self.geometric_stiffness[r]
+            stiffness = longer * self.geometric_stiffness[r] * (self.lam[r] + self.step[r])
             if at_end != 0:
-                geometric_stiffness /= self.relative_length(r)
-            worst = ti.max(worst, geometric_stiffness * ti.abs(self.lam[r] + step))
-            total += geometric_stiffness * (self.lam[r] + step)
-            size += ti.abs(self.violation[r])
-            steps += ti.abs(step)
-            most = ti.max(most, self.diagonal[r])
-        return worst, total, ti.select(steps > 0, size / steps, 0 * size), most
+                stiffness /= self.relative_length(r)
+            worst, pull, total = ti.max(worst, ti.abs(stiffness)), ti.max(pull, -stiffness), total + stiffness
+        return worst, pull, total
 
     @ti.func
     def earlier_tension(self, begin, end):
@@ -642,13 +653,18 @@ class Elimination(System):
         return worst
 
     @ti.func
-    def strain(self, begin, end, softness):
-        """Return the largest violation by which rows hold their multipliers, relative to their sizes."""
-        out = ti.cast(0, ti.f64)
+    def strain(self, begin, end):
+        """Return what rows at their yield loads give way by, relative to the size of all rows.
+
+        Along a straight rope all links bear the same, so any of them may be the one that yields.
+        """
+        left, size = ti.cast(0, ti.f64), ti.cast(0, ti.f64)
         for r in range(begin, end):
-            if self.scale[r] != 0:
-                out = ti.max(out, softness * ti.abs(self.lam[r] + self.step[r]) * self.inverse_size[r] / self.scale[r])
-        return out
+            if self.scale[r] != 0 and self.inverse_size[r] > 0:
+                size += 1 / self.inverse_size[r]
+                if self.active[r] == 0 and self.yield_load[r] < ti.math.inf:
+                    left += ti.abs(self.violation[r] + self.remaining[r]) / self.scale[r]
+        return ti.select(size > 0, left / size, 0 * left)
 
     @ti.func
     def refine_violations(self, begin, end):
@@ -703,12 +719,12 @@ class Elimination(System):
             self.left[r] = self.left[r] + self.at_start[r]
 
     @ti.func
-    def limit_tensions(self, begin, end, longer):
-        """Limit each multiplier to the tension with (omega h)^2 = SOFTENED_TO. longer: see tensions()."""
+    def let_yield(self, begin, end, longer):
+        """Bound each multiplier by the tension with (omega h)^2 = SOFTENED_TO. longer: see tensions()."""
         for r in range(begin, end):
             if self.geometric_stiffness[r] > 0:
-                most = SOFTENED_TO * self.relative_length(r) / (longer * self.geometric_stiffness[r])
-                self.step[r] = ti.max(-most, ti.min(most, self.lam[r] + self.step[r])) - self.lam[r]
+                self.yield_load[r] = SOFTENED_TO * self.relative_length(r) / (longer * self.geometric_stiffness[r])
+            self.begin_row(r)
 
     @ti.func
     def takes_step(self, b, newton):
@@ -763,8 +779,8 @@ class Elimination(System):
             if begin < end:
                 self.begin_bodies(b, begin, end)
         zero = ti.cast(0, ti.f64)
-        softness, least, inverse, tension_at_start, total_at_start, reported = zero, zero, zero, zero, zero, zero
-        stage, k, bound, soft, longer = FORWARD, 0, True, self.softness(b, begin, end), 1 + zero
+        softness, tension_at_start, total_at_start, reported = zero, zero, zero, zero
+        stage, bound, soft, longer = FORWARD, True, self.softness(b, begin, end), 1 + zero
         if soft > 0:
             longer = soft / kick
         most_borne = ti.select(soft == 1, SOFTENED_TO, TENSEST)  # what gave way bears no more at once than it did then
@@ -775,19 +791,20 @@ class Elimination(System):
         while stage != DONE:
             if ti.static(bool(self.joined)):
                 self.joined.place_bodies(b, ti.select(stage >= COMPARE, 0, 1))
-            hard = self.solve_active_set(begin, end, softness, ti.cast(stage >= COMPARE, ti.i32))
+            at_end = ti.cast(stage >= COMPARE, ti.i32)
+            hard = self.solve_active_set(begin, end, softness, at_end, stage == GIVE_WAY)
             if ti.static(self.answers):
                 self.added[b] = softness
-                if hard != 0:  # answers to moves in f32 would be their rounding over a pivot
+                if hard != 0 or stage == GIVE_WAY:  # answers to moves in f32 would be their rounding over a pivot
                     for r in range(begin, end):
                         self.added[b] = ti.max(self.added[b], self.small_pivot[r])
-            tension, total, stiffness, most = self.tensions(begin, end, ti.cast(stage >= COMPARE, ti.i32), longer)
+            tension, pull, total = self.tensions(begin, end, at_end, longer)
             if ti.static(self.limits_steps):
                 if stage <= FORWARD and self.limit_steps(begin, end) != 0:
                     continue
             if stage <= AGAIN:
                 if (hard == 0 and tension <= most_borne) or stage == AGAIN:
-                    ti.atomic_max(self.tension[None], tension / longer)
+                    ti.atomic_max(self.tension[None], pull / longer)
                     self.record_softness(b, begin, end, soft, False)
                     if ti.static(self.answers):
                         if soft == 1 and hard == 0:
@@ -801,45 +818,38 @@ class Elimination(System):
                     self.refine_violations(begin, end)
                     stage = FORWARD
                 elif hard == 2:
-                    reported, bound, softness, stage = TENSEST + zero, False, LEAST_SOFTNESS * most, GIVE_WAY
+                    reported, bound, stage = TENSEST + zero, False, GIVE_WAY
                     self.softened[b][3] = UNBORNE
-                    self.end_newton(b)
                 else:
                     tension_at_start, total_at_start, bound, stage = tension, total, hard == 0, COMPARE
             elif stage == COMPARE:
                 same = ti.abs(tension - tension_at_start) <= AGREEMENT * tension
                 same = same and ti.abs(total - total_at_start) <= AGREEMENT * ti.abs(total)
-                if same and tension <= STABLE:
+                if same and pull <= ti.min(STABLE, most_borne):
                     stage = AGAIN
                 else:
                     # A load that more substeps do not help to bear is reported as just unstable, TENSEST.
                     reported = ti.select(bound, tension_at_start, ti.min(tension, TENSEST))
                     reported = ti.select(longer > 1, ti.min(reported, TENSEST), reported)
-                    softness, stage = LEAST_SOFTNESS * most, GIVE_WAY
+                    stage = GIVE_WAY
                     self.softened[b][3] = ti.select(bound, tension_at_start, tension) / longer
-                    self.end_newton(b)
                     if longer * self.earlier_tension(begin, end) > SOFTENED_TO:
                         for r in range(begin, end):
                             self.step[r] = 0
                         ti.atomic_max(self.tension[None], reported)
                         stage = DONE
+                        self.end_newton(b)
             else:
-                k += 1
-                if k == ROUNDS or (tension <= SOFTENED_TO and (k == 1 or k > 3 or tension > 0.8 * SOFTENED_TO)):
-                    gives = bound or k == ROUNDS or self.strain(begin, end, softness) > SLIGHT
-                    self.use_end_directions(begin, end)
-                    self.limit_tensions(begin, end, longer)
-                    self.record_softness(b, begin, end, soft, k > 1)
-                    ti.atomic_max(self.tension[None], ti.select(gives, reported, tension / longer))
-                    stage = DONE
-                else:
-                    new = softness + stiffness * (tension / SOFTENED_TO - 1)
-                    if k > 1 and 1 / tension > inverse:
-                        new = least + (softness - least) * (1.1 / SOFTENED_TO - inverse) / (1 / tension - inverse)
-                    if tension > SOFTENED_TO:
-                        least, inverse = softness, 1 / tension
-                        new = ti.max(new, 1.1 * softness)
-                    softness = new
+                strain = self.strain(begin, end)
+                self.use_end_directions(begin, end)
+                self.record_softness(b, begin, end, soft, strain > 0)
+                ti.atomic_max(self.tension[None], ti.select(bound or strain > SLIGHT, reported, pull / longer))
+                stage = DONE
+            if stage == GIVE_WAY:
+                self.end_newton(b)
+                self.let_yield(begin, end, longer)
+                for r in range(begin, end):
+                    softness = ti.max(softness, LEAST_SOFTNESS * self.diagonal[r])
         if ti.static(bool(self.joined)):
             if begin < end:
                 self.joined.follow(b, self)

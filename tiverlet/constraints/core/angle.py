@@ -35,7 +35,7 @@ def _types(arity: int, dim: int, real: Any) -> Any:
 class Angle(Quantity):
     """Angles: values that are whole turns apart are equivalent, and residuals are in radians."""
 
-    unit, transcends, curved, precise = 1.0, True, True, True
+    unit, transcends, curved, precise, is_angle = 1.0, True, True, True, True
 
     def difference(self, f: np.ndarray, goal: np.ndarray) -> np.ndarray:
         """Return differences of angles, in (-pi, pi]."""

@@ -36,6 +36,7 @@ class Quantity:
     collapses = 0  # the power of a length that f is, where gradients vanish with the size of the body; else 0
     mirror: tuple[int, ...] = ()  # where it collapses: an order of the corners in which f has the other sign
     transcends = False  # needs angles, cube roots or exponentials, which SPIR-V has for f32 only
+    is_angle = False  # whether f is an angle, whose load is a torque
     foreign = False  # whether f is the user's own, of which nothing is known
     origin: Any = None  # what corners are relative to, as two f32 words, so that f32 does not round it; None: the first corner
     centred = False  # whether f is measured from a value that moves with the rest value

@@ -191,6 +191,7 @@ class Scalar(Batch):
             x = self.placed(position)
             size = np.linalg.norm(x - x[:, :1], axis=2).max(axis=1, initial=0.0)
             if self.quantity.is_distance:
+                size = np.maximum(size, self.goal)
                 some = size > SMALLEST * self.start.size
                 size = np.where(some, size, size[some].mean() if some.any() else self.start.size)
             size *= np.sqrt(squares.sum(axis=(1, 2)) / 2)
