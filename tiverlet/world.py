@@ -666,7 +666,9 @@ class World:
     def substeps(self) -> int:
         """Substeps of frames of the usual length, which others keep; with "auto", of the next frame. Assign a number, "auto", or
         None for the usual number."""
-        return self._controller.substeps if self._controller.auto else self._substeps or self._usual_substeps
+        if self._controller.auto:
+            return max(self._controller.substeps, self._usual_substeps)
+        return self._substeps or self._usual_substeps
 
     @substeps.setter
     def substeps(self, value: int | str | None) -> None:

@@ -21,7 +21,6 @@ from .step_report import StepReport
 if TYPE_CHECKING:
     from ..world import World
 
-START = 8  # substeps of the first frame
 MOST = 4096  # substeps of a frame
 PASSES = 64  # iterations of a substep
 RESIDUAL, OVERLAP = 1e-2, 0.1  # aims if no tolerance is given
@@ -82,8 +81,8 @@ class StepController:
 
     def __init__(self):
         self.auto = False
-        self.pace = Pace()  # of frames whose substeps the user has set
-        self.substeps, self.iterations = START, 1  # of the next frame
+        self.pace = Pace()  # of frames of the usual substeps, or of those that the user has set
+        self.substeps, self.iterations = 1, 1  # of the next frame
         self.dt = 0.0  # of the last frame [s]
         self.wait = 0  # frames until less effort is tried
         self.patience = [1] * OCTAVES  # frames with room before an effort is tried, by its octave
@@ -112,7 +111,7 @@ class StepController:
         tolerance = None if tolerance is None else checks.number("World.step", "tolerance", tolerance, above=0.0)
         budget = None if budget is None else checks.number("World.step", "budget", budget, above=0.0)
         end, first = float("inf") if budget is None else perf_counter() + budget, not self.dt
-        self.prepare(world.iterations, dt, tolerance, budget)
+        least = self.prepare(world._usual_substeps, world.iterations, dt, tolerance, budget)
         before, flags = world._undo  # type: ignore[misc]  # before the upload of knobs; without an upload, the present state
         kept = checkpoint.keep(world) if any(map(any, flags)) else replace(before, controller=self.memory)
         world._runner.begin(dt, self.substeps, world.iterations, self.iterations)
@@ -138,18 +137,23 @@ class StepController:
             checkpoint.put_back(world, kept)
             world._runner.begin(dt, tries.substeps, world.iterations, tries.iterations)
         self.substeps, self.iterations, self.stuck = n, k, tries.stuck  # so that the next frames do not try in vain
-        self.plan_next_frame(world.iterations, max(figures), tries.verdict, tries.count)
+        self.plan_next_frame(least, world.iterations, max(figures), tries.verdict, tries.count)
         off = report.residual / (tolerance or RESIDUAL)
         worst = max((off, MEASURES[0]), *zip(figures, MEASURES, strict=True))
         verdict = "stuck" if tries.verdict == "good" and off > 1 else tries.verdict  # links stiffen as energy allows
         return with_verdict(report, worst, risks, verdict, tries.count)
 
-    def prepare(self, iterations: int, dt: float, tolerance: float | None, budget: float | None) -> None:
-        """Choose the substeps and iterations of the first try."""
+    def prepare(self, usual: int, iterations: int, dt: float, tolerance: float | None, budget: float | None) -> int:
+        """Choose the substeps and iterations of the first try. Returns the least substeps of this frame: those that it has with
+        `usual` ones where the user does not say; fewer may do for a tolerance, or have to for a budget."""
         self.iterations = max(self.iterations, iterations)
-        if self.dt and dt != self.dt:
+        if not self.dt:
+            self.substeps = max(self.substeps, usual)
+        elif dt != self.dt:
             self.substeps = max(1, min(round(self.substeps * dt / self.dt), MOST))
         self.dt = dt
+        least = self.pace.fit(dt, usual) if tolerance is None and budget is None else 1
+        self.substeps = max(self.substeps, least)
         if budget is not None and self.cost:
             fits = max(1, min(int(0.8 * budget / (self.cost * self.iterations)), MOST))
             if fits < self.substeps or (tolerance is None and fits > 1.25 * self.substeps):
@@ -158,14 +162,15 @@ class StepController:
             self.wait -= 1
             if not self.wait:
                 self.stuck = NOTHING
+        return least
 
     def learn(self, cost: float) -> None:
         """Update the cost of an iteration [s]: at once if it is lower, since the first frame compiles; gradually if higher."""
         self.cost = min(cost, self.cost + 0.3 * (cost - self.cost)) if self.cost else cost
 
-    def plan_next_frame(self, iterations: int, figure: float, verdict: str, tries: int) -> None:
+    def plan_next_frame(self, least: int, iterations: int, figure: float, verdict: str, tries: int) -> None:
         """Choose less effort for the next frame, if this one leaves room for it; if that has just failed, wait longer before the
-        next try. figure: the largest of the figures."""
+        next try. least, iterations: that it has at least. figure: the largest of the figures."""
         self.worst = max(self.worst, figure)
         lower = self._octave - 1  # of the effort that failed, or that comes next
         if verdict != "good" or tries > 1:
@@ -178,11 +183,11 @@ class StepController:
         else:
             if self.patience[lower] - self.wait >= min(self.patience[lower], ENOUGH):
                 self._forget()
-            if not self.wait and self.substeps * self.iterations > iterations:
+            if not self.wait and (self.iterations > iterations or self.substeps > least):
                 if self.iterations > iterations:
                     self.iterations //= 2
                 else:
-                    self.substeps = (self.substeps + 1) // 2
+                    self.substeps = max(least, (self.substeps + 1) // 2)
                 self._wait()
 
     @property
