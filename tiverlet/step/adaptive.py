@@ -16,14 +16,14 @@ from . import checkpoint, energy_bound
 from .clock import Pace, energy_limit
 from .diagnostics import KINETIC, STIFFNESS
 from .integrator import FORCE
-from .step_report import StepReport
+from .step_report import COMPRESSED, StepReport
 
 if TYPE_CHECKING:
     from ..world import World
 
 MOST = 4096  # substeps of a frame
 PASSES = 64  # iterations of a substep
-RESIDUAL, OVERLAP = 1e-2, 0.1  # aims if no tolerance is given
+RESIDUAL, OVERLAP = 1e-2, COMPRESSED  # aims if no tolerance is given
 TENSION = 2.0  # (omega h)^2 across a tension: half the limit of stability
 STIFF = 2.0  # omega h from which on a spring is as good as rigid
 RISKS = {"tunnelling-risk", "stiff-force", "non-finite"}
@@ -55,9 +55,9 @@ class StepController:
     """Chooses the number of substeps of each frame: at least the usual one, but with a tolerance or a budget.
 
     A frame is undone, and repeated with twice the substeps, in these cases: a constraint turned by more than 26 degrees in a
-    substep (cos < 0.9, where SHAKE's direction is no longer good); the frame left a residual above 1e-2 or an overlap above a
-    tenth of a radius; particles vibrated across a tension with (omega h)^2 > 2; or a flag is set that shorter substeps remove. If
-    doubling the substeps, 16 or more, brings no gain, the iterations are doubled. If that brings no gain either, the frame is
+    substep (cos < 0.9, where SHAKE's direction is no longer good); the frame left a residual above 1e-2, or an overlap that is
+    flagged if it stays; particles vibrated across a tension with (omega h)^2 > 2; or a flag is set that shorter substeps remove.
+    If doubling the substeps, 16 or more, brings no gain, the iterations are doubled. If that brings no gain either, the frame is
     "stuck": among the tries that are as good, the one with the least effort is kept, and the next frames no longer aim at the
     figures that stay wrong. If each try adds more energy than the one before, violations could not be removed first, and the
     best of the earlier tries is kept.
