@@ -90,12 +90,14 @@ def test_under_no_schedule_of_substeps_a_scene_gains_energy(trial, name):
     # velocities that are read it is the same, to the work in a substep, v a h, also where loads cancel in braced bodies.
     off = []
     for label, schedule in SCHEDULES.items():
-        start, energies, flags = None, [], set()
+        start, energies, flags, trial.world.substeps = None, [], set(), None
+        usual = trial.world.substeps
         low = high = trial.structure.position
         for report in trial.frames(scheduled(name, schedule), HARD):
             start = report.energy - report.energy_change if start is None else start
             energies.append(report.energy)
             flags |= report.flags
+            assert label != "auto" or report.substeps >= usual
             x = trial.world.position
             low, high = np.minimum(low, x), np.maximum(high, x)
             if label == "constant":

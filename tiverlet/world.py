@@ -47,9 +47,9 @@ class World:
     particles: Particles. features: forces, constraints, contacts and walls, in any order; at most one Contact. A feature that is
     not in the list costs nothing.
     substeps: substeps per frame; None for as many as such scenes usually need: 20, or 4 where particles and rigid clusters fall
-    freely but for contacts; or "auto" for as many as each frame needs; springs of omega dt > 50, dt the frame, are not
-    resolved, and lose what they vibrate with (flag "energy-loss"). iterations: passes over the constraints in each substep. Both
-    may change at any time, without compiling.
+    freely but for contacts; or "auto" for these, and more where a frame needs more; springs of omega dt > 50, dt the frame,
+    are not resolved, and lose what they vibrate with (flag "energy-loss"). iterations: passes over the constraints in each
+    substep. Both may change at any time, without compiling.
     solver: how constraints are solved: Direct for chains, trees and loops; Jacobi, Chebyshev or ConjugateGradient for cloth. None
     chooses ConjugateGradient(5) where elimination would leave many stiff links to Jacobi, as in cloth; else Direct where
     constraints are connected like chains or beams; else Jacobi. explain() reports the choice and its reason.
@@ -135,8 +135,8 @@ class World:
         """Advance the world by dt [s], one frame, and return its report.
 
         Without tolerance and budget frames of the usual length have `substeps` substeps, and others as many as keep their length:
-        a late one has more of them, up to eight times `substeps`; beyond that it is flagged. With substeps="auto" it has as many
-        as it needs to be stable.
+        a late one has more of them, up to eight times `substeps`; beyond that it is flagged. With substeps="auto" it has at
+        least as many as by default, and more if it would be bad. Fewer may do for a tolerance, or have to for a budget.
         tolerance: upper bound of the residual and the overlap, both relative; of phi^2 / 24, for the angle phi by which rigid
         constraints, and beads on smooth curves, turn in a substep; of (omega h)^2 / 24 for forces that vary in space; and of
         about (omega h)^2 A / 12 for springs that vibrate by a share A of their size. The frame is repeated with more substeps
@@ -666,7 +666,9 @@ class World:
     def substeps(self) -> int:
         """Substeps of frames of the usual length, which others keep; with "auto", of the next frame. Assign a number, "auto", or
         None for the usual number."""
-        return self._controller.substeps if self._controller.auto else self._substeps or self._usual_substeps
+        if self._controller.auto:
+            return max(self._controller.substeps, self._usual_substeps)
+        return self._substeps or self._usual_substeps
 
     @substeps.setter
     def substeps(self, value: int | str | None) -> None:

@@ -1,21 +1,16 @@
 """Known faults: cells of the matrix that do not keep their equality, and why. What is mended has to be struck out."""
 
-BRAKE = "a brake slips where substeps get longer or change, below its torque"
 ALONG = "damping acts along a free axis once the substep changes: the history of a Snap is not projected"
 IMPACT = "a bounce off a wall beside contacts differs by a fraction of a substep from the bounce alone, which is exact"
 BELT = "friction on a curved wall is of first order, alone and as a row"
 PARTING = "beside contacts overlap parts 1.28 times as fast as push_out, and without velocity; alone it leaves with push_out"
 ONE_CORNER = "Taichi ends the process (scalarize.cpp) where a constraint of one corner is a row"
-FEWER = '"auto" takes 1 to 8 substeps, in which balls that roll on each other part another way than in 20 and more'
 ULP = "a digit depends on the unit of length"
 
 KNOWN: dict[tuple[str, str], str] = {
-    ("servos", "auto"): BRAKE,
-    ("balls roll on balls", "auto"): FEWER,
     ("snaps", "late 0.25"): ALONG,
     ("snaps", "uneven"): ALONG,
     ("snaps", "changed back"): ALONG,
-    ("snaps", "auto"): ALONG,
     ("angle limits", "units"): ULP,
     ("balls roll on balls", "units"): ULP,
     ("half spaces", "contact"): IMPACT,

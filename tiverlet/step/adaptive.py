@@ -16,21 +16,21 @@ from . import checkpoint, energy_bound
 from .clock import Pace, energy_limit
 from .diagnostics import KINETIC, STIFFNESS
 from .integrator import FORCE
-from .step_report import StepReport
+from .step_report import COMPRESSED, StepReport
 
 if TYPE_CHECKING:
     from ..world import World
 
-START = 8  # substeps of the first frame
 MOST = 4096  # substeps of a frame
 PASSES = 64  # iterations of a substep
-RESIDUAL, OVERLAP = 1e-2, 0.1  # aims if no tolerance is given
+RESIDUAL, OVERLAP = 1e-2, COMPRESSED  # aims if no tolerance is given
 TENSION = 2.0  # (omega h)^2 across a tension: half the limit of stability
 STIFF = 2.0  # omega h from which on a spring is as good as rigid
 RISKS = {"tunnelling-risk", "stiff-force", "non-finite"}
 FASTEST = 50.0  # omega dt of the fastest springs that substeps="auto" resolves: 8 periods in a frame, some 500 substeps
 FOLLOWS = 0.5  # of its violation: a spring that changes by less in a substep follows others, and does not vibrate by itself
 LOSS = 2e-3  # share of the largest kinetic energy that springs may lose in a second: a percent in 5 s
+UNSEEN = 0.1  # of what drag and dashpots take out of a vibration: what its substep may take besides
 GAIN = 1.4  # factor by which twice the effort must lower a figure; second order lowers it by 4, first order by 2
 FEW = 16  # substeps below which more of them may still help, although two doublings did not
 IDLE = {"substeps": 2, "iterations": 1}  # doublings without a gain after which no more are tried
@@ -52,12 +52,12 @@ WELL = 1, 1.0  # the end of the controller's memory where no frame has failed ye
 
 
 class StepController:
-    """Chooses the number of substeps of each frame.
+    """Chooses the number of substeps of each frame: at least the usual one, but with a tolerance or a budget.
 
     A frame is undone, and repeated with twice the substeps, in these cases: a constraint turned by more than 26 degrees in a
-    substep (cos < 0.9, where SHAKE's direction is no longer good); the frame left a residual above 1e-2 or an overlap above a
-    tenth of a radius; particles vibrated across a tension with (omega h)^2 > 2; or a flag is set that shorter substeps remove. If
-    doubling the substeps, 16 or more, brings no gain, the iterations are doubled. If that brings no gain either, the frame is
+    substep (cos < 0.9, where SHAKE's direction is no longer good); the frame left a residual above 1e-2, or an overlap that is
+    flagged if it stays; particles vibrated across a tension with (omega h)^2 > 2; or a flag is set that shorter substeps remove.
+    If doubling the substeps, 16 or more, brings no gain, the iterations are doubled. If that brings no gain either, the frame is
     "stuck": among the tries that are as good, the one with the least effort is kept, and the next frames no longer aim at the
     figures that stay wrong. If each try adds more energy than the one before, violations could not be removed first, and the
     best of the earlier tries is kept.
@@ -70,20 +70,20 @@ class StepController:
     since the energy before it was computed with longer substeps. Springs of omega dt > FASTEST are left unresolved, and what they
     vibrate with is lost; once that is a tenth of the largest kinetic energy, the flag "energy-loss" says so.
 
-    All figures are of the order of h^2. If they leave room for it, the next frame is tried with half the effort. Each effort has
-    a patience of its own: the number of frames in a row in which there must be room before it is tried. A failure makes it four
-    times what it was, or what that of any lower effort is. It is forgotten once the figures of up to 64 frames have left room for
-    that effort and as much again. A scene that changed back and forth between two numbers of substeps would lose or gain energy
-    with each change, and loads would swing: where passes leave a violation, a sag takes many frames to grow, so a longer substep
-    seems good for a while.
+    All figures are of the order of h^2. If they leave room for it, the next frame is tried with half the effort, but no fewer
+    substeps than usual: impacts of bodies are right to O(h), and no figure tells. Each effort has a patience of its own: the
+    number of frames in a row in which there must be room before it is tried. A failure makes it four times what it was, or what
+    that of any lower effort is. It is forgotten once the figures of up to 64 frames have left room for that effort and as much
+    again. A scene that changed back and forth between two numbers of substeps would lose or gain energy with each change, and
+    loads would swing: where passes leave a violation, a sag takes many frames to grow, and a longer substep seems good meanwhile.
 
     The cost: to repeat a frame, the state at its start is read back to the host before each frame.
     """
 
     def __init__(self):
         self.auto = False
-        self.pace = Pace()  # of frames whose substeps the user has set
-        self.substeps, self.iterations = START, 1  # of the next frame
+        self.pace = Pace()  # of frames of the usual substeps, or of those that the user has set
+        self.substeps, self.iterations = 1, 1  # of the next frame
         self.dt = 0.0  # of the last frame [s]
         self.wait = 0  # frames until less effort is tried
         self.patience = [1] * OCTAVES  # frames with room before an effort is tried, by its octave
@@ -112,7 +112,7 @@ class StepController:
         tolerance = None if tolerance is None else checks.number("World.step", "tolerance", tolerance, above=0.0)
         budget = None if budget is None else checks.number("World.step", "budget", budget, above=0.0)
         end, first = float("inf") if budget is None else perf_counter() + budget, not self.dt
-        self.prepare(world.iterations, dt, tolerance, budget)
+        least = self.prepare(world._usual_substeps, world.iterations, dt, tolerance, budget)
         before, flags = world._undo  # type: ignore[misc]  # before the upload of knobs; without an upload, the present state
         kept = checkpoint.keep(world) if any(map(any, flags)) else replace(before, controller=self.memory)
         world._runner.begin(dt, self.substeps, world.iterations, self.iterations)
@@ -126,7 +126,7 @@ class StepController:
             took = perf_counter() - begun
             self.learn(took / (n * k))
             motion, missed = motion_error(world) if tolerance else 0.0, energy_bound.missed(world, report, energy)
-            errors = tension(world, report), motion, stiffness(world), damping(world, n), missed
+            errors = tension(world, report), motion, stiffness(world), damping(world, n, energy is None), missed
             # What clusters store is estimated too low, see stored(): so they may not lean on it.
             softness = 1.0 if any(b.clusters for b in world._runner.batches) else world._clock.softness
             figures, risks = judge(report, tolerance, softness, *errors)
@@ -138,18 +138,23 @@ class StepController:
             checkpoint.put_back(world, kept)
             world._runner.begin(dt, tries.substeps, world.iterations, tries.iterations)
         self.substeps, self.iterations, self.stuck = n, k, tries.stuck  # so that the next frames do not try in vain
-        self.plan_next_frame(world.iterations, max(figures), tries.verdict, tries.count)
+        self.plan_next_frame(least, world.iterations, max(figures), tries.verdict, tries.count)
         off = report.residual / (tolerance or RESIDUAL)
         worst = max((off, MEASURES[0]), *zip(figures, MEASURES, strict=True))
         verdict = "stuck" if tries.verdict == "good" and off > 1 else tries.verdict  # links stiffen as energy allows
         return with_verdict(report, worst, risks, verdict, tries.count)
 
-    def prepare(self, iterations: int, dt: float, tolerance: float | None, budget: float | None) -> None:
-        """Choose the substeps and iterations of the first try."""
+    def prepare(self, usual: int, iterations: int, dt: float, tolerance: float | None, budget: float | None) -> int:
+        """Choose the substeps and iterations of the first try. Returns the least substeps of this frame: those that it has with
+        `usual` ones where the user does not say; fewer may do for a tolerance, or have to for a budget."""
         self.iterations = max(self.iterations, iterations)
-        if self.dt and dt != self.dt:
+        if not self.dt:
+            self.substeps = max(self.substeps, usual)
+        elif dt != self.dt:
             self.substeps = max(1, min(round(self.substeps * dt / self.dt), MOST))
         self.dt = dt
+        least = self.pace.fit(dt, usual) if tolerance is None and budget is None else 1
+        self.substeps = max(self.substeps, least)
         if budget is not None and self.cost:
             fits = max(1, min(int(0.8 * budget / (self.cost * self.iterations)), MOST))
             if fits < self.substeps or (tolerance is None and fits > 1.25 * self.substeps):
@@ -158,14 +163,15 @@ class StepController:
             self.wait -= 1
             if not self.wait:
                 self.stuck = NOTHING
+        return least
 
     def learn(self, cost: float) -> None:
         """Update the cost of an iteration [s]: at once if it is lower, since the first frame compiles; gradually if higher."""
         self.cost = min(cost, self.cost + 0.3 * (cost - self.cost)) if self.cost else cost
 
-    def plan_next_frame(self, iterations: int, figure: float, verdict: str, tries: int) -> None:
+    def plan_next_frame(self, least: int, iterations: int, figure: float, verdict: str, tries: int) -> None:
         """Choose less effort for the next frame, if this one leaves room for it; if that has just failed, wait longer before the
-        next try. figure: the largest of the figures."""
+        next try. least, iterations: that it has at least. figure: the largest of the figures."""
         self.worst = max(self.worst, figure)
         lower = self._octave - 1  # of the effort that failed, or that comes next
         if verdict != "good" or tries > 1:
@@ -178,11 +184,11 @@ class StepController:
         else:
             if self.patience[lower] - self.wait >= min(self.patience[lower], ENOUGH):
                 self._forget()
-            if not self.wait and self.substeps * self.iterations > iterations:
+            if not self.wait and (self.iterations > iterations or self.substeps > least):
                 if self.iterations > iterations:
                     self.iterations //= 2
                 else:
-                    self.substeps = (self.substeps + 1) // 2
+                    self.substeps = max(least, (self.substeps + 1) // 2)
                 self._wait()
 
     @property
@@ -334,23 +340,26 @@ def stiffness(world: "World") -> float:
         return max(probe(clock.h, clock.time), runner.sheet.item(STIFFNESS))
 
 
-def damping(world: "World", substeps: int) -> float:
+def damping(world: "World", substeps: int, changed: bool) -> float:
     """Return the energy that springs lose by their substep, relative to what they may lose, as a figure of the order of h^2.
+
+    changed: whether the scene was changed from outside before the frame.
 
     The stiff share theta of the law of springs, see Equation, takes about
 
         theta u^2 / alpha,    theta = s^4 / (1 + s^4), s = omega h
 
     from a spring that became longer by u in a substep: 2 pi s^5 of its energy in each period. Springs at rest lose nothing,
-    however stiff. Nothing counts where features brake anyway. Where bodies bounce, springs with theta > FIRM are rigid, see
-    BodyImpacts, and do not count: an impact would make them vibrate in a substep that is some 40 times shorter. Springs of more
-    than FASTEST that vibrate do not count either: to resolve them would take more time than it is worth. Where they follow a
-    slower motion, as the bends of a beam do, they count: what they lose is energy of that motion. It falls with h^5 where theta
-    is small, and with h where theta is 1.
+    however stiff. They may lose LOSS, and UNSEEN of what drag and their own dashpots take. Nothing counts where work is done:
+    springs may follow it. Where bodies bounce, springs with theta > FIRM are rigid, see BodyImpacts, and do not count: an impact
+    would make them vibrate in a substep that is some 40 times shorter. Springs of more than FASTEST that vibrate do not count
+    either: to resolve them would take more time than it is worth. Where they follow a slower motion, as the bends of a beam do,
+    they count: what they lose is energy of that motion. It falls with h^5 where theta is small, and with h where theta is 1.
     """
     runner, clock = world._runner, world._clock
     springs = [b for b in runner.batches if isinstance(b, (Scalar, Anchored)) and not b.is_kinematic and (b.compliance > 0).any()]
-    if not (springs and clock.h and energy_bound.keeps_energy(world)):
+    works = changed or any(b.driven for b in runner.batches) or energy_bound.works(world)
+    if not (springs and clock.h) or (works and not energy_bound.keeps_energy(world)):
         return 0.0
     state, memory, lost, firm = runner.scene.state, runner.memory, 0.0, 0.0
     x = state.get(memory)
@@ -365,10 +374,15 @@ def damping(world: "World", substeps: int) -> float:
             square, bent = ((now - b.offset(x - d)) ** 2).sum(axis=1), (now**2).sum(axis=1)
         theta = w**2 / (w**2 + alpha**2)
         follows = (substeps**2 * w <= FASTEST**2 * alpha) | (square < FOLLOWS**2 * bent)
-        some = (alpha > 0) & ((theta <= FIRM) | (not runner.bounces)) & follows
-        each = theta[some] * square[some] / alpha[some]
+        some = (alpha > 0) & ~b.broken & ((theta <= FIRM) | (not runner.bounces)) & follows
+        rate = theta[some] / alpha[some] - UNSEEN * b.damping[some] / clock.h
+        each = np.maximum(rate, 0.0) * square[some]
         lost, firm = lost + float(each.sum()), firm + float((theta[some] * each).sum())
-    return (substeps * lost / energy_bound.allowed_loss(world, LOSS)) ** (2 / (5 - 4 * firm / lost)) if lost else 0.0
+    if not lost:
+        return 0.0
+    drag = 2 * sum(f.rate for f in runner.drags) * runner.sheet.item(KINETIC)
+    allowed = energy_bound.allowed_loss(world, LOSS) + UNSEEN * drag * clock.frame[1]
+    return (substeps * lost / allowed) ** (2 / (5 - 4 * firm / lost))
 
 
 @np.errstate(all="ignore")  # energies may be infinite
