@@ -475,9 +475,9 @@ class Reporter:
         if flag == "softened" and tension < TENSEST:
             need = np.ceil(substeps * np.sqrt(soft / TOO_SOFT))  # of order h^2, or less where a floor of conjugate gradients acts
             return (
-                f"Springs are softer than their compliance says, by {100 * soft:.3g} % as the average of their energy: the solver "
-                "leaves violations as large. Lengths are off by so much, and loads where they come of lengths, as in a net that "
-                f"is stretched between pins. Use up to {need:.7g} substeps, or compliance=0 for what is meant to be rigid."
+                f"Springs are softer than their compliance says, by {100 * soft:.3g} % (weighted by their energy): the solver "
+                "leaves violations as large. Lengths are off by so much, and loads where they come of lengths, as in a net "
+                f"stretched between pins. Use up to {need:.7g} substeps, or compliance=0 for what is meant to be rigid."
             )
         if flag == "softened":
             return (

@@ -322,7 +322,8 @@ class Worlds:
         pressed = np.column_stack([clocks.overlap, overlap[:, :-1]])
         every: dict[str, Any] = risks(
             n, runner.diagnostics.report.farthest, bad, reach, fast, overlap, pressed, turned,
-            np.where(first, moved[:, None], 0.0), tension, figures[..., SOFTENED], stiff, np.where(first, released[:, None], 0.0), residual,
+            np.where(first, moved[:, None], 0.0), tension, figures[..., SOFTENED], stiff,
+            np.where(first, released[:, None], 0.0), residual,
         ) | self._flag_energies(figures)  # fmt: skip
         every["substeps-capped"] = np.full((len(self), 1), world._controller.pace.late(dt) > 0)
         wrong = bad < n
