@@ -17,7 +17,7 @@ def chain(n: int, k: int, first: int = 0) -> np.ndarray:
     return first + np.arange(n - k + 1)[:, None] + np.arange(k)
 
 
-@scene(flags={"unconverged", "energy-loss"})
+@scene(flags={"unconverged", "energy-loss", "softened"})
 def clamped_beams_from_rigid_to_soft_sag():
     alphas, n = (0.0, 1e-12, 1e-6, 1e-3, 1e-1, 1.0, 1e12), 8
     x = np.zeros((len(alphas), n, 3))

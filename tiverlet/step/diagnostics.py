@@ -30,9 +30,9 @@ STEPPED, STARTED, UNSTEPPED = range(3)
 ROUGH = 0.25  # of an overlap: the rounding of coordinates from which on it is the cause
 BARE = 3  # added to one of these if only the energy is needed
 # Indices on the sheet: energy, overlap, (omega h)^2 of forces, largest coordinate, kinetic energy, edges of the bounding box, and
-# by how much passes have softened springs, as a share of their compliance, weighted by their energy.
+# by how much passes have softened springs: the work of loads on violations, by that on compliance plus the kinetic energy.
 ENERGY, OVERLAP, STIFFNESS, REACH, KINETIC, EXTENT, SOFTENED = 0, 2, 3, 7, 11, 12, 15
-TOO_SOFT = 0.05  # of what compliance gives under loads: what passes may add to it, before links are told to be softer than given
+TOO_SOFT = 0.05  # of the energy of springs and of motion: what passes may add to it, before springs are told to be too soft
 
 
 @ti.data_oriented
@@ -270,7 +270,7 @@ class Diagnostics:
                 sheet[k] = total[k]
             sheet[KINETIC] = total[6]
             if total[7] > 0:
-                sheet[SOFTENED] = total[7] / total[8]
+                sheet[SOFTENED] = total[7] / (total[8] + total[6])  # where all moves, a spring at its rest value bears no load
             if ti.static(len(self.pair_forces) > 0):
                 if total[10] > 0:
                     sheet[3] = ti.max(sheet[3], total[9] / total[10])
