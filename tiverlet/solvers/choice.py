@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 USUAL_SUBSTEP = 1 / 1200  # [s] substep: 20 of a frame of 1/60 s
 MANY_STIFF = 200  # stiff constraints from which conjugate gradients are worth their sums, whatever elimination would take
 CG_STEPS = 5  # of conjugate gradients: at equal time, residuals of 5 to 20 steps are about the same; 5 take the least of a frame
-ERROR = 0.05  # a bound on that of loads by conjugate gradients, from which what is measured is five times less
+ERROR = 0.025  # a bound on that of loads by conjugate gradients; of nets with a heavy particle it is 1 %, of even ones less
 LEAST_STEPS, MOST_STEPS = 2, 20  # of conjugate gradients for soft links. More cost more of a frame than as many more substeps
 SOFT = 25  # alpha / (W h^2) from which on a Jacobi pass bears loads to 1 %: a pass adds W h^2 / 4 to the compliance
 # Products of an elimination that take as long as conjugate gradients: for each constraint, and for each system. A chain has 1 for
@@ -40,7 +40,7 @@ def choose_solver(batches: "list[Batch]", scene: "Scene", answers: bool) -> Solv
     residual is some 1e-6 of the length of a link, that of Jacobi a hundredth, in one to four times the time. Single links, too,
     where they `answer` contacts or join rigid clusters, but not clusters that are no bodies of a system. ConjugateGradient solves
     what is wider or faster by it, such as cloth and nets, where that is more of the stiff constraints, or MANY_STIFF. Its
-    residual is an eighth of that of Jacobi with as many substeps. Jacobi is left with soft links, with each by itself, and
+    residual is an eighth of that of Jacobi with as many substeps. Jacobi is left with links of SOFT, with each by itself, and
     with few inside of a cluster: these may contradict it; relaxed, they settle on a compromise.
     """
     links = solvable(batches)
@@ -161,6 +161,8 @@ class Pieces:
         w = self.scene.inv_mass
         s = np.concatenate([_stiffness(b, w) for b in self.links])
         s = s[self.solved & self.stiff & ~self.rigid]
+        if not len(s):
+            return CG_STEPS
         A = 1 - 0.75 / (1 + s**2)  # of the law, see Equation
         root = np.sqrt(1 + MARGIN * largest_eigenvalue(self.scene, self.links, w, POWER) * A * s)
         steps = np.ceil(np.log(2 / ERROR) / np.log((root + 1) / (root - 1)))
