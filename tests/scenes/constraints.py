@@ -113,7 +113,7 @@ def beads_slide_on_wires_in_space():
     return c.Particles(x, mass=[1.0, 1.0, 2.0, 1.0, 0.5]), features, {"precision": "f64", "iterations": 4}
 
 
-@scene()
+@scene(flags={"softened"})  # in one frame, after a blow of a stop
 def limbs_doors_and_struts_swing_against_their_stops():
     x = np.array(
         [[0, 0, 0], [0.5, 0, 0], [1, 0.1, 0], [3, 0, 0], [4, 0, 0], [3.5, 0, 0.8], [3.5, 0.3, -0.8], [6, 0, 0], [6.3, 0, 0]]
