@@ -17,7 +17,7 @@ def chain(n: int, k: int, first: int = 0) -> np.ndarray:
     return first + np.arange(n - k + 1)[:, None] + np.arange(k)
 
 
-@scene(flags={"unconverged", "energy-loss"})
+@scene(flags={"unconverged", "energy-loss", "softened"})
 def clamped_beams_from_rigid_to_soft_sag():
     alphas, n = (0.0, 1e-12, 1e-6, 1e-3, 1e-1, 1.0, 1e12), 8
     x = np.zeros((len(alphas), n, 3))
@@ -113,7 +113,7 @@ def beads_slide_on_wires_in_space():
     return c.Particles(x, mass=[1.0, 1.0, 2.0, 1.0, 0.5]), features, {"precision": "f64", "iterations": 4}
 
 
-@scene()
+@scene(flags={"softened"})  # in one frame, after a blow of a stop
 def limbs_doors_and_struts_swing_against_their_stops():
     x = np.array(
         [[0, 0, 0], [0.5, 0, 0], [1, 0.1, 0], [3, 0, 0], [4, 0, 0], [3.5, 0, 0.8], [3.5, 0.3, -0.8], [6, 0, 0], [6.3, 0, 0]]

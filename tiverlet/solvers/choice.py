@@ -5,7 +5,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from .conjugate import ConjugateGradient
+from .conjugate import MARGIN, POWER, ConjugateGradient
 from .corners import components, corners_of
 from .direct import Direct
 from .elimination import plan
@@ -13,6 +13,7 @@ from .jacobi import Jacobi
 from .joined import couples, joined_clusters
 from .redundancy import implied_links
 from .solver import WIDTH, Solver
+from .spectrum import largest_eigenvalue
 from .system import solvable
 
 if TYPE_CHECKING:
@@ -22,6 +23,9 @@ if TYPE_CHECKING:
 USUAL_SUBSTEP = 1 / 1200  # [s] substep: 20 of a frame of 1/60 s
 MANY_STIFF = 200  # stiff constraints from which conjugate gradients are worth their sums, whatever elimination would take
 CG_STEPS = 5  # of conjugate gradients: at equal time, residuals of 5 to 20 steps are about the same; 5 take the least of a frame
+ERROR = 0.025  # a bound on that of loads by conjugate gradients; of nets with a heavy particle it is 1 %, of even ones less
+LEAST_STEPS, MOST_STEPS = 2, 20  # of conjugate gradients for soft links. More cost more of a frame than as many more substeps
+SOFT = 25  # alpha / (W h^2) from which on a Jacobi pass bears loads to 1 %: a pass adds W h^2 / 4 to the compliance
 # Products of an elimination that take as long as conjugate gradients: for each constraint, and for each system. A chain has 1 for
 # each constraint, a ladder 6, a wheel of 12 spokes 36, nets of 8 x 8 and 9 x 9 60 and 75.
 PRODUCTS, OVERHEAD = 50, 2000
@@ -36,7 +40,7 @@ def choose_solver(batches: "list[Batch]", scene: "Scene", answers: bool) -> Solv
     residual is some 1e-6 of the length of a link, that of Jacobi a hundredth, in one to four times the time. Single links, too,
     where they `answer` contacts or join rigid clusters, but not clusters that are no bodies of a system. ConjugateGradient solves
     what is wider or faster by it, such as cloth and nets, where that is more of the stiff constraints, or MANY_STIFF. Its
-    residual is an eighth of that of Jacobi with as many substeps. Jacobi is left with soft links, with each by itself, and
+    residual is an eighth of that of Jacobi with as many substeps. Jacobi is left with links of SOFT, with each by itself, and
     with few inside of a cluster: these may contradict it; relaxed, they settle on a compromise.
     """
     links = solvable(batches)
@@ -47,7 +51,7 @@ def choose_solver(batches: "list[Batch]", scene: "Scene", answers: bool) -> Solv
     left, solved = pieces.count_stiff(~taken), pieces.count_stiff(taken)
     enough = MANY_STIFF if pieces.is_inside else min(MANY_STIFF, max(solved, 1))
     if left >= enough and all(_may_iterate(b, scene) for b in links):
-        return ConjugateGradient(CG_STEPS)
+        return ConjugateGradient(pieces.count_steps())
     return direct or Jacobi()
 
 
@@ -100,6 +104,7 @@ class Pieces:
         self.implied, self.shares = implied_links(links, scene) & ~twice, bool(twice.any())
         self.may_eliminate, self.is_inside = all(_may_eliminate(b, scene) for b in links), bool(inside.any())
         degree = np.bincount(item, minlength=len(w))
+        self.links, self.scene = links, scene
         self.solved = self.acts & ~alone
         self.stiff = np.concatenate([_stiff(b, degree * w) for b in links]) & self.solved
         self.rigid = np.concatenate([b.compliance == 0 for b in links]) & self.solved
@@ -147,12 +152,35 @@ class Pieces:
         sizes = np.bincount(self.piece[some & self.stiff], minlength=1)
         return int(sizes[sizes > 1].sum())
 
+    def count_steps(self) -> int:
+        """Return the steps of conjugate gradients that find the loads of soft links to ERROR; CG_STEPS beside rigid links.
+
+        The condition number is kappa = 1 + lambda_max A s, s = W h^2 / alpha, and the error 2 ((sqrt(kappa) - 1) / (sqrt(kappa)
+        + 1))^steps. Links that take more than MOST_STEPS count as rigid ones.
+        """
+        w = self.scene.inv_mass
+        s = np.concatenate([_stiffness(b, w) for b in self.links])
+        s = s[self.solved & self.stiff & ~self.rigid]
+        if not len(s):
+            return CG_STEPS
+        A = 1 - 0.75 / (1 + s**2)  # of the law, see Equation
+        root = np.sqrt(1 + MARGIN * largest_eigenvalue(self.scene, self.links, w, POWER) * A * s)
+        steps = np.ceil(np.log(2 / ERROR) / np.log((root + 1) / (root - 1)))
+        least = CG_STEPS if (self.rigid & self.solved).any() or (steps > MOST_STEPS).any() else LEAST_STEPS
+        return int(steps[steps <= MOST_STEPS].max(initial=least))
+
+
+def _stiffness(b: "Scalar", w: np.ndarray) -> np.ndarray:
+    """Return W h^2 / alpha of links in a usual substep, (m,), inf where rigid. w: (n,), inverse or mass-split weights, for W."""
+    W = b.weights(b.start.position, w) * USUAL_SUBSTEP**2
+    return np.divide(W, b.compliance, out=np.full(b.count, np.inf), where=b.compliance > 0)
+
 
 def _stiff(b: "Scalar", split: np.ndarray) -> np.ndarray:
-    """Return which constraints are two-sided and stiff, (m,): rigid ones, and links with a compliance alpha < W h^2.
+    """Return which constraints are two-sided and stiff, (m,): rigid ones, and links that a Jacobi pass would soften, see SOFT.
 
-    Below that, one Jacobi pass of a usual substep is softer than the link itself. split: (n,) mass-split weights, for W.
+    split: (n,) mass-split weights.
     """
     if b.side or b.arity != 2:
         return (b.compliance == 0) & (not b.side)
-    return b.compliance < split[b.indices].sum(axis=1) * USUAL_SUBSTEP**2
+    return b.compliance < SOFT * split[b.indices].sum(axis=1) * USUAL_SUBSTEP**2

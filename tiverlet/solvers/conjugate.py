@@ -19,7 +19,7 @@ from .system import REDUNDANT, SLACK, System, solvable
 if TYPE_CHECKING:
     from ..constraints.core.scalar import Scalar
 
-POWER = 30  # rounds of power iteration for lambda_max
+POWER, MARGIN = 30, 1.2  # rounds of power iteration for lambda_max, and what covers their error
 GROWTH, HIGHEST = 1.1, 1.0  # the factor by which the floor grows, and its limit, at which a link is as soft as in Jacobi
 CONVERGED = 1e-2  # of r . z at the start of an iteration: what may be left at its end
 NULL = 8  # rounding errors of d . W d: if d . A d is below that, or below REDUNDANT, direction d is in the null space of A
@@ -115,7 +115,7 @@ class CGSystem(System):
         self.noise, self.above_noise = self.reals("noise"), self.reals("loud", BLOCKS)  # r z of rounding; 1 if a row is above it
         self.null = max(REDUNDANT, NULL * self.epsilon)
         self.rounding = self.epsilon ** (2 if scene.state.compensated else 1)  # of positions
-        self._least = 1.2 * largest_eigenvalue(scene, scalars, self.blocks * scene.inv_mass, POWER) / steps**2
+        self._least = MARGIN * largest_eigenvalue(scene, scalars, self.blocks * scene.inv_mass, POWER) / steps**2
         self.least = self.memory.number(self._least, scene.real)
         _, part, _ = distinct(components(len(rows), row, who))
         self._part_of = np.zeros(scene.particles.count, dtype=np.int32)  # the part of each particle, counted from 1; 0: none

@@ -29,8 +29,10 @@ TURNS = (0, 26, 41)  # degrees, for 0, BENT and FAR
 STEPPED, STARTED, UNSTEPPED = range(3)
 ROUGH = 0.25  # of an overlap: the rounding of coordinates from which on it is the cause
 BARE = 3  # added to one of these if only the energy is needed
-# Indices on the sheet: energy, overlap, (omega h)^2 of forces, largest coordinate, kinetic energy, edges of the bounding box.
-ENERGY, OVERLAP, STIFFNESS, REACH, KINETIC, EXTENT = 0, 2, 3, 7, 11, 12
+# Indices on the sheet: energy, overlap, (omega h)^2 of forces, largest coordinate, kinetic energy, edges of the bounding box, and
+# by how much passes have softened springs: the work of loads on violations, by that on compliance plus the kinetic energy.
+ENERGY, OVERLAP, STIFFNESS, REACH, KINETIC, EXTENT, SOFTENED = 0, 2, 3, 7, 11, 12, 15
+TOO_SOFT = 0.05  # of the energy of springs and of motion: what passes may add to it, before springs are told to be too soft
 
 
 @ti.data_oriented
@@ -55,7 +57,7 @@ class Diagnostics:
         self.exponent = 0x7F800000 if step.real == ti.f32 else 0x7FF0000000000000  # of numbers that are not finite
         self.pair_forces = step.pair_forces
         self.measured = [f for f in self.pair_forces if f.potential_arity]
-        self.width = 9 if self.pair_forces else 7
+        self.width = 11 if self.pair_forces else 9
         self.stride = step.stride
         add = step.scene.memory.field
         self.blocks = BLOCKS if runtime.architecture() == "cpu" else BLOCKS**2
@@ -157,8 +159,9 @@ class Diagnostics:
     def block(self, b, h, t, frame_fraction, fresh, begin, bare):
         """Return the figures of block b of particles and constraints, and its bounding box, low and high.
 
-        Figures: energy, residual, overlap, stiffness, contacts, bad, kinetic energy; with pair forces also the two sums of
-        pair_stiffness(). begin: 1 before the first substep. bare: 1 to leave out overlap, stiffness, contacts and the box.
+        Figures: energy, residual, overlap, stiffness, contacts, bad, kinetic energy, the two sums of softening(); with pair
+        forces also those of pair_stiffness(). begin: 1 before the first substep. bare: 1 to leave out overlap, stiffness,
+        contacts and the box.
         """
         figures, low, high = self.empty_figures()
         scale, back = ti.cast(1, ti.f64), ti.cast(0, self.step.real)
@@ -184,8 +187,8 @@ class Diagnostics:
                 if ti.static(len(self.pair_forces) > 0):
                     if begin == 0:
                         change, moved = self.pair_stiffness(i, h)
-                        figures[7] += change
-                        figures[8] += moved
+                        figures[9] += change
+                        figures[10] += moved
                 for c in ti.static(self.contacts):
                     if bare == 0:
                         touching, worst = c.worst_overlap(i)
@@ -199,6 +202,9 @@ class Diagnostics:
                 if begin == 0:
                     residual = f.dev.residual_of(c, h, h2_effective, frame_fraction, fresh)
                     figures[1] = ti.max(figures[1], ti.cast(residual, ti.f64))
+                    left, given = f.dev.softening(c, h2_effective, residual)
+                    figures[7] += left
+                    figures[8] += given
                 figures[0] += f.dev.energy(c, back, h2_effective, residual)
         return figures, low, high
 
@@ -263,9 +269,11 @@ class Diagnostics:
             for k in ti.static(range(6)):
                 sheet[k] = total[k]
             sheet[KINETIC] = total[6]
+            if total[7] > 0:
+                sheet[SOFTENED] = total[7] / (total[8] + total[6])  # where all moves, a spring at its rest value bears no load
             if ti.static(len(self.pair_forces) > 0):
-                if total[8] > 0:
-                    sheet[3] = ti.max(sheet[3], total[7] / total[8])
+                if total[10] > 0:
+                    sheet[3] = ti.max(sheet[3], total[9] / total[10])
             if ti.static(self.step.integrator.forces.has_unresolved):
                 sheet[3] = ti.max(sheet[3], self.step.integrator.forces.encounter(sheet[3], total[6]))
             if low[0] <= high[0]:
@@ -345,7 +353,7 @@ class Reporter:
         self.remedy: str | None = None  # the setting that meets constraints better, computed when it is first needed
         self.fastest = step.integrator.fastest
         self.regroup()
-        self.figures = sheet[: EXTENT + step.dim]
+        self.figures, self.sheet = sheet[: EXTENT + step.dim], sheet
 
     def regroup(self) -> None:
         """Set the number of particles and the largest valid coordinate, after particles or constraints were added or removed."""
@@ -370,14 +378,14 @@ class Reporter:
         first substep [m]. released: see Runner.
         """
         energy, residual, overlap, stiff, contacts, bad, fast, reach, broken, tension, turned, _, *extent = self.figures.tolist()
-        stiff = max(stiff, self.fastest * h * h)
+        stiff, soft = max(stiff, self.fastest * h * h), float(self.sheet[SOFTENED])
         first = int(bad) if bad < self.n else None
         notes = {}
         for flag, there in risks(
-            self.n, self.farthest, bad, reach, fast, overlap, pressed, turned, moved, tension, stiff, released, residual
+            self.n, self.farthest, bad, reach, fast, overlap, pressed, turned, moved, tension, soft, stiff, released, residual
         ).items():  # fmt: skip
             if there:
-                notes[flag] = self._note(flag, first, reach, overlap, moved, tension, stiff, released, residual, substeps)
+                notes[flag] = self._note(flag, first, reach, overlap, moved, tension, soft, stiff, released, residual, substeps)
         damped = () if notes else self._damped(residual, substeps)
         report = StepReport.of(
             {
@@ -431,7 +439,7 @@ class Reporter:
         placed = f"; what was placed so parts at push_out = {max(given):g} m/s" if given else ""
         return f"Use up to {need:.7g} substeps{placed}. Where they do not help, there is less room than particles need."
 
-    def _note(self, flag, first, reach, overlap, moved, tension, stiff, released, residual, substeps) -> str:
+    def _note(self, flag, first, reach, overlap, moved, tension, soft, stiff, released, residual, substeps) -> str:
         """Return the note of a flag: its meaning and a remedy, with the figures of this frame."""
         if flag == "non-finite":
             return (
@@ -464,6 +472,13 @@ class Reporter:
                 f"A tension makes particles vibrate too fast for the substep: omega h >= {np.sqrt(tension):.3g}, stable below 2. "
                 f"Its constraints give way instead. Use about {need:.7g} substeps."
             )
+        if flag == "softened" and tension < TENSEST:
+            need = np.ceil(substeps * np.sqrt(soft / TOO_SOFT))  # of order h^2, or less where a floor of conjugate gradients acts
+            return (
+                f"Springs are softer than their compliance says, by {100 * soft:.3g} % (weighted by their energy): the solver "
+                "leaves violations as large. Lengths are off by so much, and loads where they come of lengths, as in a net "
+                f"stretched between pins. Use up to {need:.7g} substeps, or compliance=0 for what is meant to be rigid."
+            )
         if flag == "softened":
             return (
                 "A load has hardly a direction to be carried in, as that of a straight rope between two pins: its constraints "
@@ -492,7 +507,9 @@ class Reporter:
         )
 
 
-def risks(n, farthest, bad, reach, fast, overlap, pressed, turned, moved, tension, stiff, released, residual) -> dict[str, Any]:
+def risks(
+    n, farthest, bad, reach, fast, overlap, pressed, turned, moved, tension, soft, stiff, released, residual
+) -> dict[str, Any]:  # fmt: skip
     """Return whether a frame has each flag, in the order of the notes. For arrays of figures, of many frames, return arrays."""
     return {
         "non-finite": bad < n,
@@ -501,7 +518,7 @@ def risks(n, farthest, bad, reach, fast, overlap, pressed, turned, moved, tensio
         "compressed": (overlap > COMPRESSED) & (pressed > COMPRESSED),
         "turned": turned == FAR,
         "moved": moved > 0,
-        "softened": tension >= TENSEST,
+        "softened": (tension >= TENSEST) | (soft > TOO_SOFT),
         "stiff-force": stiff > STIFF,
         "unconverged": (released > 0) | (residual > UNCONVERGED),
     }

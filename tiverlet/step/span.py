@@ -67,7 +67,7 @@ class Moment:
 # Diagnostics. Then how the frame ended: whether it stopped, in which substep, before which half of a pass, and for what; how many
 # rounds of impacts and passes of impulses and of places a substep took at most; and how many threads of the team were active.
 # Then its arguments, see Span, with the number of the first thread.
-FIGURES = 15
+FIGURES = 16
 HALT, MOST, ACTIVE_THREADS = FIGURES, FIGURES + 4, FIGURES + 7
 GIVEN = tuple(range(ACTIVE_THREADS + 1, ACTIVE_THREADS + 16))
 H, START, END, TICK, FRESH, OWED, SUBSTEPS, ITERATIONS, BEGIN, HALF, RESUMED, FIRST, ORIGIN, UNTIL, PART = GIVEN

@@ -20,7 +20,7 @@ from ..features.unknown_names import answer_names, suggest
 from ..step import checkpoint, energy_bound, impulse
 from ..step import frames as kernel
 from ..step.clock import CHANGED, energy_floor, energy_limit, exceeds, falls_short, initial_margin, is_as_long
-from ..step.diagnostics import ENERGY, EXTENT, KINETIC, OVERLAP, STARTED, STEPPED, TURNS, UNSTEPPED, risks
+from ..step.diagnostics import ENERGY, EXTENT, KINETIC, OVERLAP, SOFTENED, STARTED, STEPPED, TURNS, UNSTEPPED, risks
 from ..step.integrator import shares_of
 from ..world import World
 from .clocks import NONE, Clocks
@@ -322,7 +322,8 @@ class Worlds:
         pressed = np.column_stack([clocks.overlap, overlap[:, :-1]])
         every: dict[str, Any] = risks(
             n, runner.diagnostics.report.farthest, bad, reach, fast, overlap, pressed, turned,
-            np.where(first, moved[:, None], 0.0), tension, stiff, np.where(first, released[:, None], 0.0), residual,
+            np.where(first, moved[:, None], 0.0), tension, figures[..., SOFTENED], stiff,
+            np.where(first, released[:, None], 0.0), residual,
         ) | self._flag_energies(figures)  # fmt: skip
         every["substeps-capped"] = np.full((len(self), 1), world._controller.pace.late(dt) > 0)
         wrong = bad < n

@@ -486,6 +486,11 @@ class CornerPasses(Passes):
         return left / self.equation.residual_scale(c)
 
     @ti.func
+    def softening(self, c, h2_effective, residual):
+        """Return the work of the load on what is left of the violation, and on what compliance gives."""
+        return self.equation.softening(c, h2_effective, residual)
+
+    @ti.func
     def energy(self, c, back, h2_effective, residual):
         """Return the energy of the constraint's spring."""
         out = ti.cast(0, ti.f64)

@@ -11,6 +11,7 @@ from .step_limit import StepLimit
 from .strength import Strength
 
 SMALLEST = 1e-6  # of the size of the scene: a longer length is not rounding; of the size of f at a constraint: nor is a larger f
+SHOWS = 1e-4  # of its size: a residual that is no rounding in f32, and from which on links may be told as softer than given
 ROUNDING = 1e-9  # of the size of the scene: a longer rest length is not rounding
 
 if TYPE_CHECKING:
@@ -293,6 +294,18 @@ class Equation:
             if h2_effective > 0:
                 force /= h2_effective
             out = self.spring.energy(c, w, h2_effective, out, force * force * alpha / 2)
+        return out
+
+    @ti.func
+    def softening(self, c, h2_effective, residual):
+        """Return |F| times what passes left of the violation, where it shows, and times alpha |F| [J]; 0 where rigid."""
+        out = ti.Vector.zero(ti.f64, 2)
+        if ti.static(self.spring.soft and not self.forces):
+            if h2_effective > 0 and self.stores_energy(c):
+                force = ti.abs(ti.cast(self.lam[c], ti.f64)) / h2_effective
+                out[1] = self.spring.alpha[c] * force * force
+                if residual > SHOWS:
+                    out[0] = residual * self.residual_scale(c) * force
         return out
 
     @ti.func

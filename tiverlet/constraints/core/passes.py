@@ -84,6 +84,11 @@ class Passes:
         return 0.0
 
     @ti.func
+    def softening(self, c, h2_effective, residual):
+        """Return the work [J] of the load on what passes left of a violation, and on what compliance gives; 0 where rigid."""
+        return ti.Vector.zero(ti.f64, 2)
+
+    @ti.func
     def energy(self, c, back, h2_effective, residual):
         """Return the elastic energy [J] at x - back d. residual: of residual_of(). h2_effective: 0 before the first substep."""
         return 0.0
