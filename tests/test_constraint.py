@@ -49,6 +49,18 @@ def test_beads_stay_on_their_wires_and_swing_as_pendulums(world):
     assert parabola.load.shape == (2,) and np.abs(parabola.residual).max() < 1e-7
 
 
+def test_a_bead_beside_contacts_swings_as_alone_and_bears_what_it_carries(world):
+    # A constraint of one corner is a row of contacts. Below the center of its wire it carries a disc of the same mass.
+    bead, ring = (0.0, -1.0), tv.Constraint(radius, [0, 1], [2.0, 1.0])
+    start = tv.Particles([(2.0, 0.0), bead, (0.0, -0.8)], radius=0.1)
+    w = world(start, [tv.Gravity(9.81), ring, tv.Contact()], precision="f64", substeps=40)
+    w.run(0.5)
+    alone = world(tv.Particles([(2.0, 0.0)]), [tv.Gravity(9.81), tv.Constraint(radius, [0], 2.0)], precision="f64", substeps=40)
+    alone.run(0.5)
+    assert w.position[0] == pytest.approx(alone.position[0], abs=1e-9) and w.position[1] == pytest.approx(bead, abs=1e-9)
+    assert ring.load[1] == pytest.approx(2 * 9.81, rel=1e-3)
+
+
 def test_far_from_the_origin_the_origin_moves_along(world):
     # At 1e5 m an ulp of f32 is 8 mm. Relative to an origin near the scene, a compensated world resolves micrometres.
     far = np.array([1e5 + 0.3, -1e5 - 0.7])

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 import tiverlet as tv
+from tiverlet.contact.loops import laid
 
 from .outlines import outside
 
@@ -191,6 +192,87 @@ def test_heaps_come_to_rest_and_hardly_overlap(world):
     assert max(gaps[int(np.argmax(np.array(gaps) < 0.01)) :]) > 0.03  # [m], after they have met
     w.run(4.0)
     assert np.abs(w.velocity).max() < 1e-4  # what passes leave of gravity in a frame, 5e-4 g / 60 Hz
+
+
+def plank(thin: float, y: float, length: float = 1.0, pieces: int = 1, tilt: float = 0.0):
+    """Return the corners of a plank about (0, y), with its long sides cut in pieces."""
+    x = np.linspace(-length / 2, length / 2, pieces + 1)
+    low = np.stack([x, np.full_like(x, -thin / 2)], axis=1)
+    corners = np.concatenate([low, -low])
+    return corners @ [[np.cos(tilt), np.sin(tilt)], [-np.sin(tilt), np.cos(tilt)]] + [0.0, y]
+
+
+def settled(w, loops, seconds):
+    """Return the heights of bodies after some seconds, and all flags on the way."""
+    flags = w.run(seconds).flags
+    return np.array([w.position[loop, 1].mean() for loop in loops]), flags
+
+
+@pytest.mark.parametrize("thin", [1e-3, 1e-4])
+@pytest.mark.parametrize("apart", [0.3, 0.02])
+def test_thin_planks_rest_on_each_other(world, thin, apart):
+    # They land by 1 cm in a substep. Heights are right to a twentieth of what is thin.
+    x, loops = bodies([plank(thin, 0.1 + apart * k) for k in range(3)])
+    y, flags = settled(rigid(world, x, loops, substeps=4), loops, 1.5)
+    assert y / thin == pytest.approx([0.5, 1.5, 2.5], abs=0.05) and "tunnelling-risk" not in flags
+
+
+def test_what_is_thin_between_near_corners_bears_what_it_lies_on(world):
+    # Planks cut into pieces of 37 cm lie on a box, whose corners press on the pieces: slop is a part of 1 mm, and not of a piece.
+    thin, box = 1e-3, np.array([(-0.5, 0.0), (0.5, 0.0), (0.5, 1.0), (-0.5, 1.0)])
+    x, loops = bodies([box, plank(thin, 1.3, 1.5, 4), plank(thin, 1.6, 1.5, 4)])
+    y, flags = settled(rigid(world, x, loops, substeps=2), loops, 1.5)
+    assert (y - 1.0)[1:] / thin == pytest.approx([0.5, 1.5], abs=0.05) and "tunnelling-risk" not in flags
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("substeps", [2, 40])
+@pytest.mark.parametrize("thin", [1e-3, 1e-4])
+@pytest.mark.parametrize("kind", ["tilted", "steep", "heavy", "cut", "spins"])
+def test_thin_planks_rest_on_each_other_or_their_report_says_that_they_may_not(world, kind, thin, substeps):
+    pieces, tilt = 4 if kind == "cut" else 1, {"tilted": 0.01, "steep": 0.5}.get(kind, 0.0)
+    shapes = [plank(thin, 0.4 + 0.6 * k, 1.0, pieces, tilt * (-1) ** k) for k in range(3)]
+    if kind == "heavy":
+        shapes[2] = plank(0.2, 1.2, 0.2) + [0.1, 0.0]
+    x, loops = bodies(shapes)
+    mass, v = np.full(len(x), 0.25), np.zeros_like(x)
+    if kind == "heavy":
+        mass[loops[2]] = 250.0
+    if kind == "spins":
+        arm = x[loops[2]] - x[loops[2]].mean(axis=0)
+        v[loops[2]] = 5.0 * np.stack([-arm[:, 1], arm[:, 0]], axis=1)
+    y, flags = settled(rigid(world, x, loops, substeps=substeps, more={"mass": mass, "velocity": v}), loops, 2.5)
+    right = [0.5 * thin, 1.5 * thin, 2 * thin + (0.1 if kind == "heavy" else 0.5 * thin)]
+    assert "tunnelling-risk" in flags or y / thin == pytest.approx(np.array(right) / thin, abs=0.1)
+
+
+@pytest.mark.parametrize("gap", [1e-3, 1e-4])
+def test_a_peg_slides_into_a_hole_that_is_a_little_wider(world, gap):
+    # g t^2 / 2, but for what it loses to the sides that it leans on: their edges are 2 m long, and the gap is far below 1/512 of
+    # that.
+    half, tilt = 0.1 + gap / 2, 0.6 * gap / 0.5  # a third of what the hole leaves room for
+    left = np.array([(-half - 1, -2.0), (-half, -2.0), (-half, 0.0), (-half - 1, 0.0)])
+    x, loops = bodies([plank(0.5, 0.27, 0.2, 1, tilt), left, left[::-1] * (-1, 1)])
+    start = tv.Particles(x, mass=0.25, pinned=range(4, 12))
+    w = world(start, [tv.Gravity(9.81), tv.Polygons(loops), tv.ShapeMatch([range(4)])], substeps=4)
+    w.run(0.5)
+    y = w.position[:4].mean(axis=0) - (0, 0.27)
+    assert y[1] == pytest.approx(-9.81 / 8, rel=0.03) and abs(y[0]) < gap
+
+
+@pytest.mark.parametrize(
+    ("corners", "thin"),
+    [
+        ([(0, 0), (3, 0), (3, 1), (0, 1)], [1.0] * 4),
+        ([(0, 0), (2, 0), (1, 3**0.5)], [3**0.5] * 3),  # its heights
+        ([(0, 0), (1, 0), (2, 0), (3, 0), (3, 0.1), (2, 0.1), (1, 0.1), (0, 0.1)], [0.1] * 8),
+        ([(0, 0), (3, 0), (3, 3), (2, 3), (2, 2), (1.8, 2), (1.8, 3), (0, 3)], [1.8, 1, 1, 1, 0.2, 0.2, 1, 1.8]),  # not a gap
+    ],
+)
+def test_how_thin_a_body_is_counts_ways_through_it(corners, thin):
+    x = np.array(corners, dtype=float)
+    for loop in (np.arange(len(x)), np.arange(len(x))[::-1]):
+        assert laid([loop], x)[3] == pytest.approx(thin)
 
 
 def test_bad_loops_are_named():

@@ -84,6 +84,19 @@ def test_constraints_that_are_not_met_are_flagged_with_what_helps(world, solver)
         assert better.residual < 0.11 and ("unconverged" in better.flags) == (better.residual > 0.05), better
 
 
+@pytest.mark.parametrize("contact", [False, True])
+def test_a_semi_iteration_beside_contacts_gains_no_energy(world, contact):
+    # Chebyshev's polynomial is bounded as a whole. Contacts that touch nothing leave what its steps leave.
+    way = np.linspace(0, 1.3, 9)[:, None]
+    x = way * (np.sin(0.9), -np.cos(0.9)) + (0, 2.4)
+    start = tv.Particles(x, mass=[*[0.1] * 8, 10.0], radius=0.03, pinned=[0])
+    features = [tv.Gravity(9.81), tv.Distance(np.c_[:8, 1:9]), *([tv.Contact()] if contact else [])]
+    w = world(start, features, solver=tv.Chebyshev(), substeps=20, iterations=4)
+    reports = [w.step(1 / 10 if k % 5 == 4 else 1 / 60) for k in range(60)]
+    first = reports[0].energy - reports[0].energy_change
+    assert max(r.energy for r in reports) < 1.001 * first and not set().union(*(r.flags for r in reports))
+
+
 @pytest.mark.slow
 def test_a_contradictory_rope_softens_no_other_links(world):
     # Conjugate gradients solve one system with a rope that is too short for its pins: the links of a net beside it are off by as

@@ -4,7 +4,6 @@ ALONG = "damping acts along a free axis once the substep changes: the history of
 IMPACT = "a bounce off a wall beside contacts differs by a fraction of a substep from the bounce alone, which is exact"
 BELT = "friction on a curved wall is of first order, alone and as a row"
 PARTING = "beside contacts overlap parts 1.28 times as fast as push_out, and without velocity; alone it leaves with push_out"
-ONE_CORNER = "Taichi ends the process (scalarize.cpp) where a constraint of one corner is a row"
 ULP = "a digit depends on the unit of length"
 
 KNOWN: dict[tuple[str, str], str] = {
@@ -28,10 +27,4 @@ KNOWN: dict[tuple[str, str], str] = {
     ("what starts in walls", "contact"): PARTING,
     ("what starts in a mesh", "contact"): PARTING,
     ("discs meet", "f64"): "how fast overlap parts depends on rounding: passes end by a tolerance",
-}
-
-# Those that end the process: they are not run.
-CRASHES: dict[tuple[str, str], str] = {
-    ("a bead on a formula", "contact"): ONE_CORNER,
-    ("a bead on a formula", "polygons"): ONE_CORNER,
 }

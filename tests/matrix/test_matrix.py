@@ -11,7 +11,7 @@ from tiverlet.features.feature import Feature
 from ..fuzz.trials import Find
 from .conditions import CONDITIONS, Bench, applicable
 from .crowd import Crowd
-from .faults import CRASHES, KNOWN
+from .faults import KNOWN
 from .scenes import SCENES
 
 # Options that change no motion: skins are for speed, loads has no effect any more.
@@ -24,7 +24,6 @@ def marked(name: str, condition: str, *args: str):
     """Return the parameters of a cell of the matrix; a known fault has to fail, so that it is struck out once it is mended."""
     cell = (name, condition)
     marks = [pytest.mark.xfail(strict=True, raises=Find, reason=KNOWN[cell])] if cell in KNOWN else []
-    marks += [pytest.mark.skip(reason=CRASHES[cell])] if cell in CRASHES else []
     return pytest.param(*args, marks=marks, id=f"{name}: {condition}")
 
 
@@ -83,4 +82,4 @@ def test_every_option_of_every_feature_is_shown_by_a_scene():
 
 
 def test_known_faults_are_cells_of_the_matrix():
-    assert {*KNOWN, *CRASHES} <= {*CELLS, *((name, "together") for name in TOGETHER)}
+    assert {*KNOWN} <= {*CELLS, *((name, "together") for name in TOGETHER)}

@@ -29,8 +29,9 @@ if TYPE_CHECKING:
     from .narrow_phase import DiscGeometry
     from .rows import Rows
 
+SLACK = 1 / 512  # of twice the size of what touches: what is behind an edge by less counts as in front of it; see is_beside()
+
 # Lengths relative to an edge.
-SLACK = 1 / 512  # of what is behind an edge that counts as in front of it; and see is_beside()
 STRETCH = 1.25  # longest edge, relative to its first length, for which all contacts in its middle are listed
 PAST = 1 / 4  # how far beyond the end of an edge a contact may be
 REACH = 1.35  # from one end of an edge to the farthest contact: |(1 + PAST, 1 / 2)|
@@ -47,13 +48,13 @@ class Outline(NamedTuple):
     """Bodies as arrays. Particles in no body have -1.
 
     ends: (n, 2), the next and the previous particle around the body. body: (n,), the number of the body. length: (n,) [m], of the
-    longer of the two edges of each particle, and shorter: of the other one.
+    longer of the two edges of each particle. thinnest: (n,) [m], see loops.thinnest().
     """
 
     ends: np.ndarray
     body: np.ndarray
     length: np.ndarray
-    shorter: np.ndarray
+    thinnest: np.ndarray
 
     @property
     def longest(self) -> np.ndarray:
@@ -66,8 +67,8 @@ class Outline(NamedTuple):
         return REACH * self.longest
 
     def size(self, radius: np.ndarray) -> np.ndarray:
-        """The size of particles with these radii (n,) [m], of which slop is a part: half of the shorter edge, or the radius."""
-        return np.where(self.body >= 0, self.shorter / 2, radius)
+        """The size of particles with these radii (n,) [m], of which slop is a part: half of `thinnest`, or the radius."""
+        return np.where(self.body >= 0, self.thinnest / 2, radius)
 
 
 class Edges:
@@ -191,7 +192,7 @@ class Edges:
             length = ti.sqrt(uu)
             t, n = r.dot(u) / uu, perp(u) / length
             height, shared, tips = r.dot(n), a, 0
-            outside = height >= -SLACK * length
+            outside = height >= -ti.static(2 * SLACK) * self.smaller(v, a)
             beside = self.is_beside(v, a, t, length)
             if height < 0 and height >= -length / 2 and -PAST <= t <= 1 + PAST:
                 at_end = t > 0.5
@@ -472,7 +473,7 @@ class Edges:
             if not at_end:
                 w = self.from_to(self.before(v), v, 1)
             other, n = w.norm(), perp(u) / length
-            reach, gap = ti.static(SLACK / 2) * ti.min(length, other), rest.dot(n) - self.radius.of(v) - self.radius.of(c)
+            reach, gap = ti.static(SLACK) * self.smaller(v, a), rest.dot(n) - self.radius.of(v) - self.radius.of(c)
             aligned = w.dot(u) < 0 and ti.abs(w.cross(u)) <= ti.static(SLACK / 2) * length * other
             beside = ti.abs(rest.dot(u)) <= reach * length and ti.abs(rest.dot(w)) <= reach * other
             out = aligned and beside and ti.abs(gap) <= reach and ti.abs(dr.dot(n)) <= slight
@@ -592,7 +593,7 @@ class Edges:
     def worst_overlap(self, i):
         """Return the number of contacts in which i is the vertex, or the first disc, and their worst overlap, for the report.
 
-        The overlap is relative to half of the edge, or to the radius of the smaller disc.
+        The overlap is relative to the size of what touches, or to the radius of the smaller disc.
         """
         touching, worst = 0, ti.cast(0, ti.f64)
         self.detect(i)
@@ -601,7 +602,7 @@ class Edges:
             if found[0] > 0:
                 size = ti.min(self.radius.of(i), self.radius.of(j))
                 if found[1] > DISCS:
-                    size = self.state.separation(self.after(j), j).norm() / 2
+                    size = self.smaller(i, j)
                 elif size == 0:
                     size = ti.max(self.radius.of(i), self.radius.of(j))
                 worst = ti.max(worst, found[0] / size)

@@ -374,6 +374,18 @@ class Impulses:
         return out + ti.cast(ti.max(of_body, 0), self.real)
 
     @ti.func
+    def force(self, i):
+        """Return the sum over the own rows of particle i of the square of what forces add to its displacement [m^2].
+
+        That counts up to where LANDS of it is what places can part in a substep. What lacks more could end behind a thin body.
+        """
+        out, kick = ti.cast(0, self.real), self.rows.kick(i)
+        for row in range(self.rows.own[i], self.rows.end[i]):
+            most = self.rows.most_parting(self.rows.size_at(i, row), -1 + 0 * out) / LANDS
+            out += ti.min(kick.dot(kick), most * most)
+        return out
+
+    @ti.func
     def start_passes(self):
         """Before the first pass: no extrapolation, and what rows may lack. One thread calls it."""
         rows, force = self.total(ROWS), self.total(FORCE)  # the sum over rows of the squared displacement by forces

@@ -12,14 +12,15 @@ of a body in the substep in which it acts, and bodies on links bounce, slide and
 violated by at the end is for places to remove, and no reason for an impulse later.
 
 Links of a System that solves them at once are no rows: the system answers, see Elimination.answer_part(). Those of one that takes
-steps answer what contacts add, as softly as its floor, see ConjugateGradient; what its steps leave is left.
+steps answer what contacts add, as softly as its floor, see ConjugateGradient; what its steps leave is left. So do those of a
+semi-iteration, see Chebyshev: a step of Jacobi after its last one would end another polynomial, which is not bounded.
 """
 
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from ..device import always, inline, ti
+from ..device import always, inline, never, ti
 from ..device.number import OnDevice
 from ..solvers.corners import corners_of
 from .limits import CLOSE, FEW, RELAXATION
@@ -131,7 +132,7 @@ class Links:
     @ti.func
     def note_open(self, batch: ti.template(), c, r):  # type: ignore[valid-type]
         """Note whether row r needs passes: as its link is relaxed alone, which passes complete, or was touched by contacts."""
-        self.open[r] = ti.cast(batch.dev.equation.touched[c] != 0 or self.is_alone(batch, c), self.real)
+        self.open[r] = ti.cast(batch.dev.equation.touched[c] != 0 or self.is_completed(batch, c), self.real)
 
     @ti.func
     def prepare(self, batch: ti.template(), c, r, h, h2_effective, share, fresh, bodies: ti.template()):  # type: ignore[valid-type]
@@ -168,12 +169,13 @@ class Links:
             weight += split * n.dot(self.gradient[self.slot[e]])
             firm += eigenvalue * n.dot(self.gradient[self.slot[e]])
             size += split * ti.sqrt(n.dot(n))
-        if ti.static(self.iterates):
-            if not self.is_alone(batch, c):
-                # Its system has left it as soft as its floor, and as near as its steps come: it answers what contacts add alone.
+        if ti.static(self.is_left(batch)):
+            if not self.is_completed(batch, c):
+                # Its solver has left it as near as its steps come, a system as soft as its floor: it answers what contacts add.
                 violation *= 0
-                if self.begin[r] < self.begin[r + 1]:
-                    alpha = ti.max(alpha, A * W * self.slots.system.floor_at(self.slot[self.begin[r]]))
+                if ti.static(self.iterates):
+                    if self.begin[r] < self.begin[r + 1]:
+                        alpha = ti.max(alpha, A * W * self.slots.system.floor_at(self.slot[self.begin[r]]))
         acts = W > 0 and weight > 0  # a link of a system has no corners here, and no weight
         self.stiff[r] = ti.select(acts, ti.static(RELAXATION) / ti.max(A * weight + alpha, FEW), 0 * W)
         self.firm[r] = ti.select(acts, 1 / ti.max(A * firm + alpha, FEW), 0 * W)
@@ -187,17 +189,23 @@ class Links:
                     low, high = ti.max(low, -cap), ti.min(high, cap)
         self.least[r], self.most[r] = low - lam, high - lam
         mu = batch.dev.equation.answered[c] * self.rows.scale[None]
-        if self.is_alone(batch, c):
+        if self.is_completed(batch, c):
             mu -= lam
         mu = ti.min(ti.max(mu, self.least[r]), self.most[r])
         if not acts:
             mu = 0 * mu
         self.mu[r], self.start[r], self.step[r] = mu, mu, 0 * mu
 
+    def is_left(self, batch: Any) -> bool:
+        """Return whether a solver that takes steps leaves constraints of a batch violated, and goes on in the next substep."""
+        return self.iterates or bool(batch.arity and batch.dev.semi_iterates)
+
     @inline
-    def is_alone(self, batch, c):
-        """Whether constraint c belongs to no system, so that its solver goes part of the way."""
-        return batch.dev.is_outside_systems(c) if batch.arity else always()
+    def is_completed(self, batch, c):
+        """Whether passes of contacts complete what the solver of constraint c has left: it is relaxed alone, without steps."""
+        if not batch.arity:
+            return always()
+        return never() if batch.dev.semi_iterates else batch.dev.is_outside_systems(c)
 
     @ti.func
     def relax(self, r, bodies: ti.template(), beta):  # type: ignore[valid-type]
@@ -232,15 +240,15 @@ class Links:
         slack = self.bound_places(batch, c, r, lam + mu, holds)
         if rigid and self.stiff[r] > 0 and (holds or slack) and (reached or u != 0 or mu != 0 or left != 0):
             touched = 1
-        if ti.static(self.iterates):
-            if not self.is_alone(batch, c):  # what contacts leave of it is for its system, as all that it leaves itself
+        if ti.static(self.is_left(batch)):
+            if not self.is_completed(batch, c):  # what contacts leave of it is for its solver, as all that it leaves itself
                 touched = 0
         self.violation[r] = ti.select(slack or touched != 0, left + u + self.violation[r], 0 * u)
         if self.begin[r] < self.begin[r + 1]:
             batch.dev.equation.touched[c] = touched
         if self.stiff[r] > 0:
             batch.dev.equation.take_answer(c, mu, self.start[r], weight, slight, self.rows)
-            if self.is_alone(batch, c):
+            if self.is_completed(batch, c):
                 batch.dev.equation.answered[c] = lam + mu
         elif self.begin[r] < self.begin[r + 1]:
             batch.dev.equation.answered[c] = 0 * mu

@@ -1,6 +1,7 @@
 """Bodies as loops of particles, in NumPy: orientation, edge lengths, and particles that start inside of them (2D)."""
 
 from collections.abc import Callable, Iterable
+from typing import Any
 
 import numpy as np
 
@@ -27,13 +28,13 @@ def checked(loops: Iterable) -> list[np.ndarray]:
 def laid(loops: list[np.ndarray], x: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     """Return the arrays of an Outline for particles at x (n, 2) [m], and refuse flat loops.
 
-    These are the next and the previous particle, counterclockwise (n, 2), the number of the loop (n,), both -1 in no loop, and
-    the lengths of the longer and the shorter edge (n,) [m].
+    These are the next and the previous particle, counterclockwise (n, 2), the number of the loop (n,), both -1 in no loop, the
+    length of the longer edge (n,) [m], and thinnest() (n,) [m].
     """
     n = len(x)
-    ends, body, longer, shorter = np.full((n, 2), -1), np.full(n, -1), np.zeros(n), np.zeros(n)
+    ends, body, longer = np.full((n, 2), -1), np.full(n, -1), np.zeros(n)
     if not loops:
-        return ends, body, longer, shorter
+        return ends, body, longer, np.zeros(n)
     corner, begin, owner = flat(loops)
     if corner.max() >= n:
         k = int(owner[np.argmax(corner >= n)])
@@ -57,8 +58,34 @@ def laid(loops: list[np.ndarray], x: np.ndarray) -> tuple[np.ndarray, np.ndarray
     left = area[owner] > 0
     ends[corner, 0], ends[corner, 1], body[corner] = np.where(left, after, before), np.where(left, before, after), owner
     before = edge[turned(begin, -1)]
-    longer[corner], shorter[corner] = np.maximum(edge, before), np.minimum(edge, before)
-    return ends, body, longer, shorter
+    longer[corner] = np.maximum(edge, before)
+    return ends, body, longer, thinnest(x, ends[:, 0], ends[:, 1])
+
+
+def thinnest(x: np.ndarray, after: np.ndarray, before: np.ndarray) -> np.ndarray:
+    """Return how thin a body is at each particle and its edges, (n,) [m]; 0 for particles in no body.
+
+    That is the length of an edge, or a way through the body from a corner to another edge. after, before: the next and the
+    previous particle, counterclockwise, -1 in no body.
+    """
+    z: Any = x @ [1, 1j]
+    u, back = z[after] - z, z[before] - z  # conj(u) w = u . w + i u x w
+    convex, length, corner = (u.conj() * back).imag > 0, np.abs(u), np.flatnonzero(after >= 0)
+    at_corner, at_edge = np.where(after >= 0, np.minimum(length, length[before]), 0), np.where(after >= 0, length, 0)
+    v, a = corner, after[corner]
+    while len(v):  # the edge from a is one further from its corner v in each turn
+        ends = after[a] == v
+        if ends.any():
+            v, a = v[~ends], a[~ends]
+        r = z[v] - z[a]
+        t = np.clip((u[a].conj() * r).real / length[a] ** 2, 0, 1)
+        way, along = t * u[a] - r, ((a == after[v]) & (t == 0)) | ((after[a] == before[v]) & (t == 1))
+        left, right = (u[v].conj() * way).imag > 0, (way.conj() * back[v]).imag > 0
+        inward = (left & right) | ((left | right) & ~convex[v])
+        width = np.where(inward & ~along, np.abs(way), np.inf)
+        at_corner[v], at_edge[a] = np.minimum(at_corner[v], width), np.minimum(at_edge[a], width)
+        a = after[a]
+    return np.minimum(at_corner, np.minimum(at_edge, at_edge[before]))
 
 
 def flat(loops: list[np.ndarray]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

@@ -129,6 +129,7 @@ class PairContact(Feature):
         walls, ahead, skin = scene.walls, self._ahead, self._present_skin
         dev.rows = Rows(scene, self.table, friction, bounces, in_turn, turns, walls, team, self.push_out, ahead, edges)
         dev.answers = Answers(scene, batches, dev.rows) if batches else None
+        dev.fast = dev.rows.fast
         dev.responses = Responses(scene, dev.rows, scene.state.spins and friction, dev.answers)
         dev.islands = Islands(scene, dev.rows, dev.responses, team)
         dev.impulses = Impulses(scene, dev.rows, dev.responses, team)
@@ -157,7 +158,6 @@ class PairContact(Feature):
             dev.events.bind(dev.list, discs)
             dev.rows.events = dev.events if dev.reports else None
         dev.rows.bind(dev.list, discs)
-        dev.fast = scene.memory.field("Contact.fast", None, kind=ti.i32)
         return dev.search
 
     def enter(self, scene: Scene) -> None:
@@ -236,13 +236,12 @@ class PairContact(Feature):
 
     @ti.func
     def note_motion(self, stale, fast):
-        """Set the flags of a stale list and of fast particles. Each is read first: threads that write to one place are slow."""
+        """Set the flags of a stale list and of fast particles, see Rows.note_fast()."""
         if stale != 0:
             if self.dev.list.stale[None] == 0:
                 self.dev.list.stale[None] = MOVED
         if fast != 0:
-            if self.dev.fast[None] == 0:
-                self.dev.fast[None] = 1
+            self.dev.rows.note_fast()
 
     @ti.func
     def reaction(self, i):

@@ -56,6 +56,8 @@ class Places:
                     if on_edge and not (still and others_still):
                         slop = self.rows.edges.smaller(i, other)
                         gap, n = self.rows.edges.gap_now(i, row)
+                        if gap < -slop:  # deeper than the middle of what it presses on: it may come out behind
+                            self.rows.note_fast()
                 if not (on_edge or (still and others_still)):
                     r = self.state.separation(i, other)
                     distance = self.rows.geometry.contact_distance(i, other)

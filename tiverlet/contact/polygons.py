@@ -33,12 +33,12 @@ class Polygons(PairContact):
     friction, restitution: as in Contact. Particles in no loop touch as in Contact. There are no impacts in turn.
     skin: how far beyond contact distance pairs are listed [m], "auto" for the median of 0.15 of the longer edge of each vertex,
     and of 0.75 of the radius of each disc in no loop. It affects speed only.
-    push_out: largest speed [m/s] at which what overlaps parts; None, the default, for a quarter of half an edge in a substep.
+    push_out: largest speed [m/s] at which what overlaps parts; None, the default, for a quarter of a size in a substep.
     loads: has no effect any more: all pairs store the load that they bear.
 
     Corners that face each other touch as discs, by their radii. A vertex inside of another body leaves through the nearest edge
-    that faces its own body, if it is not deeper than half the length of that edge. In a substep nothing should get that deep, and
-    the step flags "tunnelling-risk" where it might. Particles that start deeper are refused.
+    that faces its own body, if it is not deeper than half the length of that edge. Particles that start deeper are refused. What
+    gets deeper than the middle of a thin body may come out behind it, and has the flag "tunnelling-risk".
 
     Two sharp corners that have passed each other part over the nearer edge. Other bodies that cross without a corner of one
     inside of the other, such as two bars, are not detected. Walls act on particles: a sharp corner of a wall passes between two.

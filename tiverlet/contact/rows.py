@@ -118,6 +118,8 @@ class Rows:
         # the part of State.kick() that it adds to displacements; and spin_shares().
         self.h, self.frame_fraction = add("Contact.h", None), add("Contact.frame_fraction", None, width=2)
         self.scale, self.whole, self.turn_shares = (add(f"Contact.{name}", None) for name in ("scale", "whole", "turn_shares"))
+        # Whether particles moved so far that a contact may be missed, or went deeper into a body than its middle, in the frame.
+        self.fast = add("Contact.fast", None, kind=ti.i32)
         self.list: Any = None
         self.geometry: Any = None
 
@@ -215,10 +217,25 @@ class Rows:
         """Return the size of particle i, of which slop is a part [m]."""
         return at(self.edges.size, i) if self.edges else self.radius.of(i)
 
+    @ti.func
+    def size_at(self, i, row):
+        """Return the size of what touches at a row of particle i, the smaller one; of a point, the size of the other [m]."""
+        out = self.size(i)
+        if row < self.pressed[i]:
+            other = self.size(self.other.field[row])
+            out = ti.select(out > 0, ti.min(out, other), other)
+        return out
+
     @inline
     def when_of(self, i):
         """Return the part of the substep before the impact of the island of particle i, 0 without one."""
         return at(self.when, i) if self.bounces else ti.cast(0, self.real)
+
+    @ti.func
+    def note_fast(self):
+        """Note that a contact may be missed. The flag is read first: threads that write to one place are slow."""
+        if self.fast[None] == 0:
+            self.fast[None] = 1
 
     @ti.func
     def note_when(self, i, when):

@@ -2,7 +2,7 @@
 
 from typing import Any
 
-from .language import always, at, copied, copied_with, inline, record, ti
+from .language import always, at, copied, copied_with, inline, never, record, ti
 from .patches import enabled
 
 called: Any = copied
@@ -33,4 +33,4 @@ from . import copies  # noqa: E402
 
 copies.apply()  # last, with and without patches: it wraps the final subscript function
 
-__all__ = ["always", "at", "called", "called_with", "inline", "record", "ti"]
+__all__ = ["always", "at", "called", "called_with", "inline", "never", "record", "ti"]

@@ -119,6 +119,11 @@ def always() -> Any:
     return ti.cast(1, ti.i32) > 0
 
 
+def never() -> Any:
+    """Return an expression that is false, in a Python function that kernels call as it is."""
+    return ti.cast(0, ti.i32) > 0
+
+
 class _Text(str):
     """A string that can be weakly referenced, unlike a str."""
 

@@ -449,7 +449,10 @@ class Reporter:
         if flag == "out-of-range":
             return f"A coordinate is out of range: it reached {reach:g} m, and beyond {self.farthest:g} m the precision fails."
         if flag == "tunnelling-risk":
-            return "A particle moved by more than its own size in one substep and may have passed another; use more substeps."
+            return (
+                "A particle moved by more than its own size in one substep, or got deeper into a body than its middle, and "
+                "may have passed it; use more substeps."
+            )
         if flag == "compressed":
             return (
                 f"Contacts are pressed or thrown together by more than they hold: the worst overlaps by {100 * overlap:.3g} % "

@@ -100,10 +100,12 @@ class RowPass:
                         row = self.rows.find(i, begin, end, row)
                         own = ti.cast(row - self.rows.own[i], self.real)
                         noise += self.noise(i) * own
+                        force += self.impulses.force(i)
                         if ti.static(bool(self.answers)):
-                            own += self.answers.links.sum_of(self.answers.links.open, i) + self.answers.count_left(i)
+                            links = self.answers.links.sum_of(self.answers.links.open, i) + self.answers.count_left(i)
+                            own += links
+                            force += links * kick.dot(kick)
                         count += own
-                        force += own * kick.dot(kick)
                     if ti.static(self.rows.bounces):
                         if ti.static(self.in_turn):
                             hits += self.impacts.count(i)

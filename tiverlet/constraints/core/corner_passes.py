@@ -201,7 +201,7 @@ class CornerPasses(Passes):
         row = self.row[c]
         if row >= 0:
             left = ti.cast(self.slots.system.left[row], self.real) + (self.excess_now(c) - self.before[c])
-            extent = self.corners.relative_positions(c, 0)[1, :].norm()
+            extent = self.corners.relative_positions(c, 0)[self.corners.first, :].norm()
             digits = self.state.digits_of_difference(self.corners.member(c, 0), extent)
             if ti.abs(left) * self.inverse_size[c] * extent <= digits or not self.slots.system.bears(row):
                 left = 0 * left
