@@ -1,5 +1,6 @@
 """Elimination: dense solutions, and where tensions are too large. For chains with known answers see test_cases.py."""
 
+import contextlib
 import re
 from itertools import product
 
@@ -11,6 +12,9 @@ from tiverlet.report import CASES
 from tiverlet.report.accuracy.cases.case import links
 
 from .conftest import case, rerun, rms
+from .fuzz.scenes import Structure
+from .fuzz.trials import Trial
+from .scenes import SCENES
 
 
 def dense(x, d, w, pairs, rest):
@@ -203,3 +207,49 @@ def test_shorter_substeps_never_make_it_worse(world):
     w, want = world(start, features, precision="f32-compensated"), case("D01_double_pendulum")["values"]["t2.0"]["xy"]
     for substeps in (20, 80, 320, 1280, 5120):
         assert rms(rerun(w, 2.0, substeps=substeps).position[1:], want) <= 1.1e-5 * (20 / substeps) ** 2 + 1e-6, substeps
+
+
+@pytest.mark.parametrize("count, heavy, substeps", [(10, 10.0, 20), (10, 3.0, 20), (20, 10.0, 40)])
+def test_a_straight_rope_bears_what_its_substep_can_stand(world, count, heavy, substeps):
+    # Links of masses m yield at the tension T of (omega h)^2 = 4 T h^2 / (m l) = 1. Two of them hold M where 2 T sin = M g.
+    h, m, length = 1 / 60 / substeps, 0.01, 1 / count
+    x, mass = np.linspace((0, 0), (1, 0), count + 1), np.full(count + 1, m)
+    mass[count // 2] = heavy
+    start = tv.Particles(x, mass=mass, pinned=[0, count])
+    features = [tv.Gravity(9.81), tv.Distance(links(count)), tv.Drag(5.0)]
+    w = world(start, features, substeps=substeps, precision="f64", solver=tv.Direct())
+    energy = [w.step(1 / 60).energy for _ in range(480)]
+    assert "softened" in w.last.flags and max(energy) <= 0
+    across, down = w.position[count // 2]
+    assert np.sin(np.arctan2(-down, across)) == pytest.approx(2 * heavy * 9.81 * h * h / (length * m), rel=0.03)
+
+
+@pytest.mark.parametrize("substeps", [2, 4, 8, 20])
+def test_what_gives_way_brings_in_no_energy_and_bears_again(taichi, substeps):
+    # A drawbridge falls into slack ropes, which jerk at a load far above what a substep can stand. At 4 substeps its ropes yield at
+    # l m / (4 h^2) = 1770 N, where 1880 N hang on them.
+    scene = SCENES["a drawbridge falls into slack ropes"].structure
+    with contextlib.closing(Trial(Structure(scene.particles, scene.features, {"substeps": substeps}))) as trial:
+        reports = [trial.world.step(1 / 60) for _ in range(600 if substeps < 20 else 180)]
+    assert max(r.energy for r in reports) < reports[0].energy - reports[0].energy_change
+    assert any("softened" in r.flags for r in reports) == (substeps < 20)
+    assert substeps < 8 or reports[-1].residual < 1e-3
+
+
+@pytest.mark.parametrize("count, substeps", [(21, 4), (41, 20), (81, 20)])
+def test_pressure_makes_columns_buckle_and_nothing_vibrate(world, count, substeps):
+    # A column of bars and bends under P = 1.03 of Euler's load, pi^2 EI / L^2, and half of its own weight. Its links bear (omega h)^2
+    # up to 5. Elastica: P = (2 K / pi)^2 = 1 + k^2 / 2 + 11 k^4 / 32, deflection k L / K. Hinges of 1 / 20 of L take a percent.
+    L, EI = 2.0, 200.0
+    load, y, k = 1.03 * np.pi**2 * EI / L**2, np.linspace(0, L, count), np.arange(count)
+    mass = np.full(count, L / (count - 1) / 2)
+    mass[-1] = load / 9.81
+    bends = tv.Bend(np.stack([k[:-2], k[1:-1], k[2:]], axis=1), 0.0, compliance=L / (count - 1) / EI)
+    start = tv.Particles(np.stack([1e-3 * np.sin(np.pi * y / L), y], axis=1), mass=mass, pinned=[0])
+    features = [tv.Gravity(), tv.Distance(links(count - 1)), bends, tv.Drag(3.0), tv.Path([count - 1], [(0, -1), (0, L + 1)])]
+    w = world(start, features, substeps=substeps, precision="f64")
+    reports = [w.step(1 / 60) for _ in range(480)]
+    assert max(r.energy for r in reports) < reports[0].energy - reports[0].energy_change and w.last.clean
+    square = (np.sqrt(0.25 + 4 * 11 / 32 * (0.03 + 9.81 * L / 4 / (load / 1.03))) - 0.5) * 16 / 11
+    K = np.pi / 2 * (1 + square / 4 + 9 * square**2 / 64)
+    assert np.abs(w.position[:, 0]).max() == pytest.approx(np.sqrt(square) * L / K, rel=0.02)

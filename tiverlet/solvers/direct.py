@@ -31,9 +31,9 @@ ROUNDS = 24  # at most, in search of the rows that are at bounds
 LONG_MOVE, CALM_TENSION = 1e-5, 0.35
 UNKNOWN, UNMET, ENDED = range(3)  # whether a system takes it: decided by the moves of the first step; yes; no
 
-# (omega h)^2 to which tensions are softened, with directions at the end of the substep. There the move is a step down the
-# gradient of a convex energy, sum lam |r|. Up to 1, it adds at most lam times the shortening of the links.
-SOFTENED_TO = 1.0
+# (omega h)^2 at which rows yield, with directions at the end of the substep. There the move is a step down the gradient of a
+# convex energy, sum lam |r|. Up to 1, it adds at most lam times the shortening of the links.
+YIELD = 1.0
 LEAST_SOFTNESS = 2e-12  # of the largest diagonal: the least softness, so that no pivot vanishes
 # Strain up to which giving way is not told where no tension bears the load: a straight rope so much longer sags by 0.3 %.
 SLIGHT = 2e-5
@@ -42,7 +42,7 @@ GONE = 0.1  # of its violations: what may be left of them a substep after they s
 SOFTENED = "system.softened"  # a field, by its name in recordings
 
 # Stages of solve(). ROUGH: directions at the start of the substep, violations in f32. FORWARD: the same directions, accurate
-# violations. COMPARE: directions at the end. AGAIN: as FORWARD, once both agree. GIVE_WAY: directions at the end, softened.
+# violations. COMPARE: directions at the end. AGAIN: as FORWARD, once both agree. GIVE_WAY: directions at the end, rows yield.
 ROUGH, FORWARD, AGAIN, COMPARE, GIVE_WAY, DONE = range(6)
 
 
@@ -69,7 +69,7 @@ class Direct(Solver):
     f64 in every world, because its pivots span the mass ratio.
 
     A load that cannot be borne to first order (a straight rope between two pins) leaves the tension undetermined with directions
-    at the start of the substep. Such a system is solved with directions at the end, and softened until (omega h)^2 <= 1; so is
+    at the start of the substep. Such a system is solved with directions at the end, where links yield at (omega h)^2 = 1; so is
     one with a transverse (omega h)^2 > 4. It gives way and loses energy, with the flag "softened", see
     tiverlet/solvers/README.md.
     """
@@ -134,7 +134,7 @@ class Elimination(System):
         row, corner, particle = self.corners(scalars, slots)
         self.plan, self.parts, self.entries = found, self.memory.number(found.parts), self.memory.number(len(found.column))
         self.solved, self.has_implied = self.memory.number(len(found.rows)), len(rows) > len(found.rows)
-        # Of each part that gave way in the last substep: (h' / h)^2 for the substep h' that it is softened for; the sum of its
+        # Of each part that gave way in the last substep: (h' / h)^2 for the substep h' whose yield loads it has; the sum of its
         # violations; the energy that these store with the multipliers found, times h^2; and (omega h)^2 of the tension that it
         # would have borne, UNBORNE where none bears the load. Else 0. The first number is below 0 where the part seems to have
         # borne its load, until its violations are seen to be gone.
@@ -212,14 +212,14 @@ class Elimination(System):
             self.memory.write(self.softened, np.stack([kept, off, energy * ratio**2, tension * ratio**2], axis=1))
 
     def softness_of_longer(self, h: float) -> tuple[float, float]:
-        """Return (h' / h)^2 for the longest substep h' that a part is softened for, and the energy that such parts store in
+        """Return (h' / h)^2 for the longest substep h' whose yield loads a part has, and the energy that such parts store in
         substeps h [J]."""
         soft, _, energy, _ = self.memory.read(self.softened).T
         longer = np.abs(soft) > 1
         return float(np.abs(soft).max(initial=1.0)), float(energy[longer].sum()) / h**2
 
     def stiffen(self, factor: float) -> None:
-        """Let parts that are softened for a longer substep bear tensions that are `factor` times as large."""
+        """Let parts with the yield loads of a longer substep bear tensions that are `factor` times as large."""
         state = self.memory.read(self.softened)
         soft = np.abs(state[:, 0])
         state[:, 0] = np.copysign(np.where(soft > 1, np.maximum(soft / factor, 1.0), soft), state[:, 0])
@@ -228,7 +228,7 @@ class Elimination(System):
     def _can_stiffen(self) -> np.ndarray:
         """Return a mask of the parts that gave way in a longer substep, and need not in this one, (parts,)."""
         soft, _, _, tension = self.memory.read(self.softened).T
-        return (np.abs(soft) > 1) & (tension <= SOFTENED_TO)
+        return (np.abs(soft) > 1) & (tension <= YIELD)
 
     @property
     def can_stiffen(self) -> bool:
@@ -685,7 +685,7 @@ class Elimination(System):
 
     @ti.func
     def softness(self, b, begin, end):
-        """Return (h' / h)^2 for the substep h' that part b is softened for; 0 if it is not."""
+        """Return (h' / h)^2 for the substep h' whose yield loads part b has; 0 if it does not give way."""
         soft, off = ti.abs(self.softened[b][0]), ti.cast(0, ti.f64)
         if soft > 0 and begin < end and self.earlier_tension(begin, end) == 0:
             for r in range(begin, end):
@@ -720,10 +720,18 @@ class Elimination(System):
 
     @ti.func
     def let_yield(self, begin, end, longer):
-        """Bound each multiplier by the tension with (omega h)^2 = SOFTENED_TO. longer: see tensions()."""
+        """Bound each multiplier by the tension with (omega h)^2 = YIELD. longer: see tensions().
+
+        A row with such bounds bears what it can, whatever it is violated by, as if its energy were its yield load times |C|. With
+        J at the end x_1 before the impulses w J^T lam, and C convex as lengths are, those of pull, lam < 0, do the work
+
+            lam . (J d + A lam / 2) <= lam . (C(x_1) - C(x_0)) + lam . A lam / 2,   A = J w J^T
+
+        which is at most what that energy falls by, as long as (omega h)^2 <= 1: no energy comes of it.
+        """
         for r in range(begin, end):
             if self.geometric_stiffness[r] > 0:
-                self.yield_load[r] = SOFTENED_TO * self.relative_length(r) / (longer * self.geometric_stiffness[r])
+                self.yield_load[r] = YIELD * self.relative_length(r) / (longer * self.geometric_stiffness[r])
             self.begin_row(r)
 
     @ti.func
@@ -767,9 +775,8 @@ class Elimination(System):
         """Find the steps of all multipliers in system b. kick: how many kicks they supply: 1, except at a start.
 
         Particles under tension vibrate transversely. If the substep is too long for that, or the tension is undetermined (see
-        Direct), the system is solved with directions at the end of the substep. It is softened until its tension is small enough:
-        where one load cannot be borne, one over the tension grows linearly with the softness. If an earlier pass found a larger
-        tension, softening would take most of that tension back, along other directions; then the system takes no step.
+        Direct), the system is solved with directions at the end of the substep, and rows yield, see let_yield(). If an earlier
+        pass found a larger tension, that would take most of it back, along other directions; then the system takes no step.
         """
         begin, end = self.part_begin[b], self.part_begin[b + 1]
         if ti.static(self.sleeps):
@@ -783,7 +790,7 @@ class Elimination(System):
         stage, bound, soft, longer = FORWARD, True, self.softness(b, begin, end), 1 + zero
         if soft > 0:
             longer = soft / kick
-        most_borne = ti.select(soft == 1, SOFTENED_TO, TENSEST)  # what gave way bears no more at once than it did then
+        most_borne = ti.select(soft == 1, YIELD, TENSEST)  # what gave way bears no more at once than it did then
         if ti.static(len(self.precise) > 0):
             stage = ROUGH
         if begin == end:
@@ -833,7 +840,7 @@ class Elimination(System):
                     reported = ti.select(longer > 1, ti.min(reported, TENSEST), reported)
                     stage = GIVE_WAY
                     self.softened[b][3] = ti.select(bound, tension_at_start, tension) / longer
-                    if longer * self.earlier_tension(begin, end) > SOFTENED_TO:
+                    if longer * self.earlier_tension(begin, end) > YIELD:
                         for r in range(begin, end):
                             self.step[r] = 0
                         ti.atomic_max(self.tension[None], reported)

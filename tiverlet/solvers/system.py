@@ -137,12 +137,12 @@ class System:
         """Keep parts that give way as soft as they are, where the next substep is `ratio` times as long as the last one."""
 
     def softness_of_longer(self, h: float) -> tuple[float, float]:
-        """Return (h' / h)^2 for the longest substep h' that a part is softened for, and the energy that such parts store in
+        """Return (h' / h)^2 for the longest substep h' whose yield loads a part has, and the energy that such parts store in
         substeps h [J]."""
         return 1.0, 0.0
 
     def stiffen(self, factor: float) -> None:
-        """Let parts that are softened for a longer substep bear tensions that are `factor` times as large."""
+        """Let parts with the yield loads of a longer substep bear tensions that are `factor` times as large."""
 
     @ti.func
     def bound_row(self, r, low, high):
