@@ -239,7 +239,8 @@ def test_what_gives_way_brings_in_no_energy_and_bears_again(taichi, substeps):
 @pytest.mark.parametrize("count, substeps", [(21, 4), (41, 20), (81, 20)])
 def test_pressure_makes_columns_buckle_and_nothing_vibrate(world, count, substeps):
     # A column of bars and bends under P = 1.03 of Euler's load, pi^2 EI / L^2, and half of its own weight. Its links bear
-    # (omega h)^2 up to 5. Elastica: P = (2 K / pi)^2 = 1 + k^2 / 2 + 11 k^4 / 32, deflection k L / K. Hinges of 1 / 20 of L take a percent.
+    # (omega h)^2 up to 5. Elastica: P = (2 K / pi)^2 = 1 + k^2 / 2 + 11 k^4 / 32, deflection k L / K.
+    # Hinges of 1 / 20 of L take a percent.
     L, EI = 2.0, 200.0
     load, y, k = 1.03 * np.pi**2 * EI / L**2, np.linspace(0, L, count), np.arange(count)
     mass = np.full(count, L / (count - 1) / 2)
