@@ -23,12 +23,16 @@ def bricks(kind, height):
         return np.r_[x, slab], np.r_[radius, np.zeros(4)], [4, 5, 6, 7], [tv.ShapeMatch(brick.loops), polygons]
     if kind == "links":
         return x, radius, [], [tv.Distance([(0, 1), (1, 2), (2, 3), (3, 0), (0, 2), (1, 3)]), tv.Contact(), floor]
-    return x, radius, [], [tv.ShapeMatch(brick.loops), tv.Contact(), floor]
+    return x, radius, [], [tv.ShapeMatch(brick.loops), *([tv.Contact()] if kind == "clusters" else []), floor]
+
+
+KINDS = ["Polygons", "a pinned body", "clusters", "links"]
+ALONE = pytest.mark.xfail(strict=True, reason="a last word of walls knows no slip of bodies, see colliders/README.md")
 
 
 @pytest.mark.parametrize("substeps", [4, 20])
 @pytest.mark.parametrize("height", [0.2, 0.02])
-@pytest.mark.parametrize("kind", ["Polygons", "a pinned body", "clusters", "links"])
+@pytest.mark.parametrize("kind", [*KINDS, pytest.param("clusters alone", marks=ALONE)])
 def test_bricks_slip_beyond_static_friction_and_slide_against_dynamic_friction(world, kind, height, substeps):
     # On a slope (gravity leans by a): at rest up to tan a = static, then g (sin a - dynamic cos a). A row has slipped once it
     # has slid by a 64th of g h^2 in a substep, which takes t0 = h / 64 / (sin a - static cos a). What moves uphill stops, and

@@ -218,3 +218,18 @@ def test_what_is_stopped_stands_still(world, precision):
             x = w.position
             w.step(1 / 60)
             assert w.position[1, 0] - x[1, 0] == pytest.approx(1 / rate, rel=1e-3 if precision == "f64" else 0.1)
+
+
+@pytest.mark.slow
+@pytest.mark.xfail(strict=True, reason="velocities are read from the reactions of the last substep, some of which count as blows")
+def test_what_is_squeezed_is_told_to_move_as_it_does(world):
+    # A rigid disc of 40 cm is held in a gap of 30 cm.
+    disc = tv.shapes.ball((0, 0.2), 0.18, rings=2)
+    lid = tv.HalfSpace((0, -1), -0.43)
+    features = [tv.Gravity(), tv.ShapeMatch([range(len(disc.position))]), lid, tv.HalfSpace((0, 1)), tv.Contact()]
+    w = world(tv.Particles(disc.position, mass=0.1, radius=0.02), features)
+    for _ in range(40):
+        lid.offset = min(-0.3, lid.offset + 0.01)
+        before = w.position
+        w.step(1 / 60)
+    assert np.abs(w.velocity).max() < 1 + 120 * np.abs(w.position - before).max()

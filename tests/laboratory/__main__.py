@@ -25,6 +25,7 @@ EXPERIMENTS = {
     "gpu": "what runs on a GPU, with which bits, how fast, and how often the host waits (parts: its tables)",
     "piles": "piles of discs and boxes beside Box2D and pymunk, in turns (parts: discs, equal discs, boxes, towers)",
     "structures": "ladders, bridges, wheels, tents on ropes: strain against run time, by solver and load",
+    "schedules": "which passive scenes gain energy in uneven frames and under changes of substeps, by solver (parts: scenes)",
     "pay": "what each feature costs: fields, bytes and time of the scene of demos/pay.py",
     "mutations": "faults of the past, put back one by one: which tests notice (parts: beginnings of commits)",
     "grains": "heaps, drums and silos of spinning grains, beside LAMMPS (parts: its tables)",
