@@ -65,7 +65,8 @@ def gained(name: str, scene: Scene, solver: str) -> Iterator[tuple]:
                         places.append(trial.world.position)
                 share = max(r.energy for r in reports) - (reports[0].energy - reports[0].energy_change)
                 flags = set().union(*(r.flags for r in reports)) & {*RISKS, "energy-gain", "non-finite", "out-of-range"}
-                yield name, label, share / extent(trial, np.array(places)), ", ".join(sorted(flags))
+                size = extent(trial, np.array(places))
+                yield name, label, share / size if size else 0.0, ", ".join(sorted(flags))
 
 
 def extent(trial: Trial, places: np.ndarray) -> float:

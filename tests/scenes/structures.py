@@ -89,7 +89,7 @@ def two_sheets_are_sewn_together():
     edge = np.unique(np.concatenate([k[0], k[-1], k[:, 0]]))
     threads = c.Distance(np.stack([edge, edge + n * n], axis=1), rest=0.0)
     braces = c.Distance(sheets.braces, compliance=1e-3, damping=0.01)
-    return c.Particles(sheets.position, mass=0.002), [c.Distance(sheets.links), braces, threads, c.Drag(2.0)]
+    return c.Particles(sheets.position, mass=0.002), [c.Gravity(G), c.Distance(sheets.links), braces, threads, c.Drag(2.0)]
 
 
 @scene()

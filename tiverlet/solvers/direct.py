@@ -24,17 +24,16 @@ CONTRADICTION = 1e-6  # of its violation: a redundant constraint with a smaller 
 SMALL_PIVOT = 2e-3  # of the contribution of its heaviest particle: below, a load is hardly borne to first order
 AGREEMENT = 0.25  # of the tension: how far solutions with directions at the two ends of the substep may differ there
 STABLE = 2.0  # (omega h)^2 that is allowed there: half the limit of stability
-ROUNDS = 24  # at most, in search of the rows that are at bounds
+ROUNDS = 12  # at most, in search of the rows that are at bounds
 
 # A system takes a second Newton step if a particle moved by more than the square root of LONG_MOVE, in lengths, unless a tension
 # was above CALM_TENSION, (omega h)^2. Such vibrations are not resolved and gain energy; the error of the first step removes it.
 LONG_MOVE, CALM_TENSION = 1e-5, 0.35
 UNKNOWN, UNMET, ENDED = range(3)  # whether a system takes it: decided by the moves of the first step; yes; no
 
-# (omega h)^2 at which rows yield, with directions at the end of the substep. There the move is a step down the gradient of a
-# convex energy, sum lam |r|. Up to 1, it adds at most lam times the shortening of the links.
+# (omega h)^2 at which rows yield. A pull then is a step down the gradient of a convex energy, sum lam |r|, see let_yield().
 YIELD = 1.0
-LEAST_SOFTNESS = 2e-12  # of the largest diagonal: the least softness, so that no pivot vanishes
+LEAST_SOFTNESS, SOFTER = 1e-9, 100.0  # of the largest diagonal, so that no pivot vanishes; and the factor of a next try
 # Strain up to which giving way is not told where no tension bears the load: a straight rope so much longer sags by 0.3 %.
 SLIGHT = 2e-5
 UNBORNE = 1e30  # (omega h)^2 of a tension that is undetermined
@@ -42,7 +41,7 @@ GONE = 0.1  # of its violations: what may be left of them a substep after they s
 SOFTENED = "system.softened"  # a field, by its name in recordings
 
 # Stages of solve(). ROUGH: directions at the start of the substep, violations in f32. FORWARD: the same directions, accurate
-# violations. COMPARE: directions at the end. AGAIN: as FORWARD, once both agree. GIVE_WAY: directions at the end, rows yield.
+# violations. COMPARE: directions at the end. AGAIN: as FORWARD, once both agree. GIVE_WAY: rows yield.
 ROUGH, FORWARD, AGAIN, COMPARE, GIVE_WAY, DONE = range(6)
 
 
@@ -374,13 +373,13 @@ class Elimination(System):
         return move
 
     @ti.func
-    def use_end_directions(self, begin, end):
-        """Set the moves of corners to the gradients at the end of the substep."""
-        for r in range(begin, end):
-            for q in range(self.product_begin[r], self.product_begin[r + 1]):
-                s = self.product[q][1]
-                if s == self.product[q][2]:
-                    self.move[s] = self.move_at_end(s)
+    def gradient_at_start(self, s):
+        """Return the gradient at the corner with slot s, in the direction in which its multiplier moves it."""
+        i = self.particle_of[s]
+        out = self.move[s] / self.w[i]
+        if ti.static(self.has_shared_particles):
+            out *= self.blocks_of[i]
+        return out
 
     @called
     @ti.func
@@ -447,7 +446,7 @@ class Elimination(System):
         self.bends_far[b] = 0
         for r in range(self.part_begin[b], self.part_begin[b + 1]):
             self.answer[r], self.solution[r], self.gap[r] = 0, self.lam[r] + self.step[r], 0
-            if self.is_limited(r):
+            if self.is_limited(r) and self.active[r] == 0:
                 self.gap[r] = self.violation[r] + self.remaining[r] + self.alpha[r] * self.step[r]
         if self.added[b] > 0:
             self.assemble(self.part_begin[b], self.part_begin[b + 1], self.added[b], 0)
@@ -565,42 +564,49 @@ class Elimination(System):
         return out
 
     @ti.func
+    def is_misplaced(self, r):
+        """Whether row r has passed its bound, or is at one and needs another multiplier."""
+        out = False
+        if self.is_limited(r) and self.scale[r] != 0:
+            left = self.violation[r] + self.remaining[r] + self.alpha[r] * self.step[r]
+            inside, leaves = self.is_inside(r, self.lam[r] + self.step[r]), self.leaves_bound(r, self.bound[r], left)
+            out = ti.select(self.active[r] != 0, not inside, leaves)
+        return out
+
+    @ti.func
     def update_active_set(self, begin, end, at_end):
-        """Hold rows at bounds that they passed, and let go those that need other multipliers. Returns whether any changed."""
+        """Move misplaced rows to the bounds that they have passed, or off theirs. Returns whether any was."""
+        found = False
         for r in range(begin, end):
             self.remaining[r] = 0
-        changed = 0
-        for r in range(begin, end):
             for q in range(self.product_begin[r], self.product_begin[r + 1]):
                 at = self.product[q]
                 self.remaining[r] = self.remaining[r] + self.scale[r] * self.coupling(at, at_end) * self.step[self.row_of[at[2]]]
-            if self.is_limited(r) and self.scale[r] != 0:
-                new = self.lam[r] + self.step[r]
-                left = self.violation[r] + self.remaining[r] + self.alpha[r] * self.step[r]
-                acts = ti.select(self.active[r] != 0, self.is_inside(r, new), self.leaves_bound(r, self.bound[r], left))
-                if acts != (self.active[r] != 0):
-                    self.active[r], changed = 1 - self.active[r], 1
-                    if not acts:
-                        self.bound[r] = self.nearest_bound(r, new)
-        return changed
+            if self.is_misplaced(r):
+                found = True
+                self.active[r] = 1 - self.active[r]
+                if self.active[r] == 0:
+                    self.bound[r] = self.nearest_bound(r, self.lam[r] + self.step[r])
+        return found
 
     @ti.func
     def solve_active_set(self, begin, end, softness, at_end, gives_way):
-        """Find the steps of all rows that act, by an active set. Returns the result of eliminate()."""
-        hard, k, bounded = 0, 0, gives_way or ti.static(self.bounds)
-        while k < ROUNDS:
+        """Find the steps of all rows that act, by an active set. Returns the result of eliminate(), and whether it was found."""
+        hard, k, bounded, found = 0, 0, gives_way or ti.static(self.bounds), False
+        while k < ROUNDS and not found:
             self.assemble(begin, end, softness, at_end)
-            found = self.eliminate(begin, end)
-            hard = ti.max(found, ti.select(hard == 2, 2, 0))  # a contradiction is kept: its row may be switched off next
+            now = self.eliminate(begin, end)
+            hard = ti.max(now, ti.select(hard == 2, 2, 0))  # a contradiction is kept: its row may be switched off next
             k += 1
-            if not bounded or self.update_active_set(begin, end, at_end) == 0:
-                k = ROUNDS
+            found = True
+            if bounded:
+                found = not self.update_active_set(begin, end, at_end)
         if bounded:
             for r in range(begin, end):
                 if self.scale[r] != 0:
                     low, high = self.bounds_of(r)
                     self.step[r] = ti.max(low, ti.min(high, self.lam[r] + self.step[r])) - self.lam[r]
-        return hard
+        return hard, found
 
     @ti.func
     def limit_steps(self, begin, end):
@@ -643,6 +649,14 @@ class Elimination(System):
                 stiffness /= self.relative_length(r)
             worst, pull, total = ti.max(worst, ti.abs(stiffness)), ti.max(pull, -stiffness), total + stiffness
         return worst, pull, total
+
+    @ti.func
+    def largest_diagonal(self, begin, end):
+        """Return the largest entry of the diagonal of the matrix that was assembled last."""
+        out = ti.cast(0, ti.f64)
+        for r in range(begin, end):
+            out = ti.max(out, self.diagonal[r])
+        return out
 
     @ti.func
     def earlier_tension(self, begin, end):
@@ -722,14 +736,21 @@ class Elimination(System):
     def let_yield(self, begin, end, longer):
         """Bound each multiplier by the tension with (omega h)^2 = YIELD. longer: see tensions().
 
-        A row with such bounds bears what it can, whatever it is violated by, as if its energy were its yield load times |C|. With
-        J at the end x_1 before the impulses w J^T lam, and C convex as lengths are, those of pull, lam < 0, do the work
+        A row with such bounds bears what it can, whatever it is violated by, as if its energy were its yield load times |C|. Let
+        N be its direction at the end of the substep, before the impulses w N^T lam, where it pulls, lam < 0, and at the start
+        where it presses. C is convex, as lengths are, so lam . N d <= lam . (C_1 - C_0), and the impulses do the work
 
-            lam . (J d + A lam / 2) <= lam . (C(x_1) - C(x_0)) + lam . A lam / 2,   A = J w J^T
+            lam . N (d + w N^T lam / 2) <= lam . (C_1 - C_0) + lam . A lam / 2,   A = N w N^T
 
         which is at most what that energy falls by, as long as (omega h)^2 <= 1: no energy comes of it.
         """
         for r in range(begin, end):
+            for q in range(self.product_begin[r], self.product_begin[r + 1]):
+                s = self.product[q][1]
+                if s == self.product[q][2]:
+                    if self.lam[r] + self.step[r] > 0:
+                        self.gradient[s] = self.gradient_at_start(s)
+                    self.move[s] = self.move_at_end(s)
             if self.geometric_stiffness[r] > 0:
                 self.yield_load[r] = YIELD * self.relative_length(r) / (longer * self.geometric_stiffness[r])
             self.begin_row(r)
@@ -798,14 +819,19 @@ class Elimination(System):
         while stage != DONE:
             if ti.static(bool(self.joined)):
                 self.joined.place_bodies(b, ti.select(stage >= COMPARE, 0, 1))
-            at_end = ti.cast(stage >= COMPARE, ti.i32)
-            hard = self.solve_active_set(begin, end, softness, at_end, stage == GIVE_WAY)
+            at_end, gives_way = ti.cast(stage == COMPARE, ti.i32), stage == GIVE_WAY
+            hard, found = self.solve_active_set(begin, end, softness, at_end, gives_way)
+            if gives_way and not found and softness < self.largest_diagonal(begin, end):
+                softness *= SOFTER
+                for r in range(begin, end):
+                    self.begin_row(r)
+                continue
             if ti.static(self.answers):
                 self.added[b] = softness
                 if hard != 0 or stage == GIVE_WAY:  # answers to moves in f32 would be their rounding over a pivot
                     for r in range(begin, end):
                         self.added[b] = ti.max(self.added[b], self.small_pivot[r])
-            tension, pull, total = self.tensions(begin, end, at_end, longer)
+            tension, pull, total = self.tensions(begin, end, ti.cast(stage >= COMPARE, ti.i32), longer)
             if ti.static(self.limits_steps):
                 if stage <= FORWARD and self.limit_steps(begin, end) != 0:
                     continue
@@ -832,7 +858,7 @@ class Elimination(System):
             elif stage == COMPARE:
                 same = ti.abs(tension - tension_at_start) <= AGREEMENT * tension
                 same = same and ti.abs(total - total_at_start) <= AGREEMENT * ti.abs(total)
-                if same and pull <= ti.min(STABLE, most_borne):
+                if same and ti.select(soft == 1, tension, pull) <= ti.min(STABLE, most_borne):
                     stage = AGAIN
                 else:
                     # A load that more substeps do not help to bear is reported as just unstable, TENSEST.
@@ -848,15 +874,13 @@ class Elimination(System):
                         self.end_newton(b)
             else:
                 strain = self.strain(begin, end)
-                self.use_end_directions(begin, end)
                 self.record_softness(b, begin, end, soft, strain > 0)
                 ti.atomic_max(self.tension[None], ti.select(bound or strain > SLIGHT, reported, pull / longer))
                 stage = DONE
             if stage == GIVE_WAY:
                 self.end_newton(b)
                 self.let_yield(begin, end, longer)
-                for r in range(begin, end):
-                    softness = ti.max(softness, LEAST_SOFTNESS * self.diagonal[r])
+                softness = LEAST_SOFTNESS * self.largest_diagonal(begin, end)
         if ti.static(bool(self.joined)):
             if begin < end:
                 self.joined.follow(b, self)

@@ -86,10 +86,15 @@ def checked_for_loss(world: "World", report: StepReport) -> StepReport:
         return report
     omega = fastest_spring(world)
     need = np.ceil(report.substeps * omega * clock.h * (omega * clock.time / SMALL_LOSS) ** 0.2)
+    cause = f"Rigid links lose some where they turn far in a substep. Use more substeps, at first {2 * report.substeps}. "
+    if need > report.substeps:
+        cause = (
+            f"Springs that a substep does not resolve are damped by it: the fastest has omega h = {omega * clock.h:.3g}. "
+            f"With {need:.7g} substeps it would lose {100 * SMALL_LOSS:g} % by now. "
+        )
     note = (
         f"Nothing is said to take energy out of the scene, but it has {bound - report.energy:.3g} J less than it had; its "
-        f"kinetic energy was {clock.kinetic:.3g} J at most. Springs that a substep does not resolve are damped by it: the "
-        f"fastest has omega h = {omega * clock.h:.3g}. With {need:.7g} substeps it would lose {100 * SMALL_LOSS:g} % by now. "
+        f"kinetic energy was {clock.kinetic:.3g} J at most. {cause}"
         "Otherwise say that energy is lost: give springs damping, or make rigid what is too stiff (compliance 0)."
     )
     return replace(report, flags=report.flags | {LOST}, notes=(*report.notes, note))
