@@ -25,8 +25,8 @@ CONVERGED = 1e-2  # of r . z at the start of an iteration: what may be left at i
 NULL = 8  # rounding errors of d . W d: if d . A d is below that, or below REDUNDANT, direction d is in the null space of A
 BLOCKS = 64  # partial sums: a fixed number, so that totals are the same bit for bit on any number of threads
 # Indices into `sums`: r . z; the length of the step, later the weight of the old direction in the next one; the length of a step
-# that is taken back; r . z at the start of the iteration; 1 if multipliers are limited to what the substep can stand.
-RZ, FACTOR, TAKEN_BACK, RZ_START, LIMITED = range(5)
+# that is taken back; r . z at the start of the iteration; the share of multipliers that the substep can stand.
+RZ, FACTOR, TAKEN_BACK, RZ_START, BORNE = range(5)
 
 
 class ConjugateGradient(Solver):
@@ -215,7 +215,7 @@ class CGSystem(System):
         ti.loop_config(serialize=True)
         for _ in range(self.team.one(1, thread)):
             now = self.sum_partials()
-            self.sums[None] = ti.Vector([now, 0, 0, now, 0], ti.f64)
+            self.sums[None] = ti.Vector([now, 0, 0, now, 1], ti.f64)
         self.team.wait()
 
     @ti.func
@@ -237,7 +237,7 @@ class CGSystem(System):
 
     @ti.func
     def iterate(self, thread):
-        """Take one step of conjugate gradients. If it needs too large a tension, rows bear what they can, and no step follows."""
+        """Take one step of conjugate gradients. If it needs too large a tension, all bear what they can, and no step follows."""
         self.compute_moves(thread)
         self.compute_step_length(thread)
         self.apply_step(thread)
@@ -324,7 +324,7 @@ class CGSystem(System):
             for b in range(1, BLOCKS):
                 worst = ti.max(worst, self.worst[b])
             ti.atomic_max(self.tension[None], worst)
-            back, limited = 0 * now, ti.select(worst > TENSEST, 1 + 0 * now, 0 * now)
+            back, borne = 0 * now, ti.min(TENSEST / ti.max(worst, TENSEST), 1 + 0 * now)
             if ti.static(self.limits_steps):
                 gain, over = self.gain[0], self.too_long[0]
                 for b in range(1, BLOCKS):
@@ -332,10 +332,10 @@ class CGSystem(System):
                     over += self.too_long[b]
                 if gain > 0 and over > 0:  # as in Elimination.limit_steps(): such a step is taken back
                     back = self.sums[None][FACTOR]
-            if back != 0 or limited != 0:
+            if back != 0 or borne < 1:
                 now = 0
             first = self.sums[None][RZ_START]
-            self.sums[None] = ti.Vector([now, ti.select(before > 0, now / before, 0 * now), back, first, limited], ti.f64)
+            self.sums[None] = ti.Vector([now, ti.select(before > 0, now / before, 0 * now), back, first, borne], ti.f64)
         self.team.wait()
 
     @ti.func
@@ -345,10 +345,8 @@ class CGSystem(System):
             if self.sums[None][TAKEN_BACK] != 0:
                 self.step[r] = self.step[r] - self.sums[None][TAKEN_BACK] * self.direction[r]
                 self.residual[r] = 0
-            if self.sums[None][LIMITED] != 0:
-                if self.geometric_stiffness[r] > 0:
-                    most = TENSEST / self.geometric_stiffness[r]
-                    self.step[r] = ti.max(-most, ti.min(most, self.lam[r] + self.step[r])) - self.lam[r]
+            if self.sums[None][BORNE] < 1:
+                self.step[r] = self.sums[None][BORNE] * self.step[r]
                 self.residual[r] = 0
             self.direction[r] = (
                 self.inverse_diagonal[r] * self.residual[r] + ti.cast(self.sums[None][FACTOR], self.real) * self.direction[r]

@@ -198,6 +198,7 @@ class Elimination(System):
         # remaining: the change of violations by the steps.
         self.active, self.bound, self.remaining = ints("active", 0 * side), reals("bound"), reals("left")
         self.yield_load = reals("yield_load")
+        self.is_length = ints("is_length", np.repeat([b.quantity.is_distance for b in scalars], [b.count for b in scalars])[rows])
         if self.bounds:
             self.low = reals("low", values=np.where(side < 0, 0.0, -np.inf))
             self.high = reals("high", values=np.where(side > 0, 0.0, np.inf))
@@ -651,6 +652,15 @@ class Elimination(System):
         return worst, pull, total
 
     @ti.func
+    def unlimited_tension(self, begin, end):
+        """Return the largest (omega h)^2 of rows that do not yield, since they are no lengths."""
+        out = ti.cast(0, ti.f64)
+        for r in range(begin, end):
+            if self.is_length[r] == 0:
+                out = ti.max(out, self.geometric_stiffness[r] * ti.abs(self.lam[r] + self.step[r]))
+        return out
+
+    @ti.func
     def largest_diagonal(self, begin, end):
         """Return the largest entry of the diagonal of the matrix that was assembled last."""
         out = ti.cast(0, ti.f64)
@@ -751,7 +761,7 @@ class Elimination(System):
                     if self.lam[r] + self.step[r] > 0:
                         self.gradient[s] = self.gradient_at_start(s)
                     self.move[s] = self.move_at_end(s)
-            if self.geometric_stiffness[r] > 0:
+            if self.geometric_stiffness[r] > 0 and self.is_length[r] != 0:
                 self.yield_load[r] = YIELD * self.relative_length(r) / (longer * self.geometric_stiffness[r])
             self.begin_row(r)
 
@@ -821,6 +831,7 @@ class Elimination(System):
                 self.joined.place_bodies(b, ti.select(stage >= COMPARE, 0, 1))
             at_end, gives_way = ti.cast(stage == COMPARE, ti.i32), stage == GIVE_WAY
             hard, found = self.solve_active_set(begin, end, softness, at_end, gives_way)
+            found = found and (not gives_way or longer * self.unlimited_tension(begin, end) <= YIELD)
             if gives_way and not found and softness < self.largest_diagonal(begin, end):
                 softness *= SOFTER
                 for r in range(begin, end):

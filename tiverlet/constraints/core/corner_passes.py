@@ -370,11 +370,13 @@ class CornerPasses(Passes):
     def geometric_stiffness(self, c, W):
         """Return (omega h)^2 of the fastest transverse vibration per multiplier: 4 w / l in a chain of links l, where W = 2 w.
 
-        0 for angles: on a path of links an angle is linear in their directions, so its torque makes nothing vibrate.
+        0 for springs of angles in the plane: there an angle is linear in the directions of its links, so its torque makes nothing
+        vibrate.
         """
         out = 2 * W * self.inverse_size[c]
-        if ti.static(self.quantity.is_angle):
-            out *= 0
+        if ti.static(self.quantity.is_angle and self.state.dim == 2):
+            if not self.spring.is_rigid(c):
+                out *= 0
         if ti.static(self.slots.converges and self.slots.can_soften):  # W contains it
             out /= self.slots.softness[None]
         return out
