@@ -179,9 +179,11 @@ def test_discs_come_to_rest_on_a_bridge(bridge):
 def test_a_bridge_that_gave_way_bears_again_without_a_blow(bridge):
     # Under 60 kg the tension is too large for the substep, and the bridge stretches by 2 %. Once it bears its load again, the
     # rest of that is removed by places. As an impulse, it would push what lies on it, too: that gave 480 J in a frame, of 500.
+    # What links that yield have taken comes back while they shorten: at most a tenth of it in a frame, and never all.
     w = bridge(60)
     reports = [w.step(1 / 60) for _ in range(90)]
     assert any("softened" in r.flags for r in reports) and "softened" not in reports[-1].flags
     energy = np.array([r.energy for r in reports])
-    assert np.diff(energy).max() < 30 and not any("energy-gain" in r.flags for r in reports)
+    assert np.diff(energy).max() < 0.1 * np.ptp(energy) and energy.max() < energy[0] + 1e-3
+    assert not any("energy-gain" in r.flags for r in reports)
     assert reports[-1].residual < 1e-3
