@@ -155,7 +155,8 @@ def _whip() -> Findings:
             yield at_most(f"energy {w.last.energy:+.1e} J", w.last.energy, 0.0, finite(w))
 
 
-@row(21, "links that contradict each other (triangle 1, 1, 3)", "bounded for 1e5 substeps, the residual is least squares")
+@row(21, "links that contradict each other (triangle 1, 1, 3)", "bounded for 1e5 substeps, the residual is least squares",
+     known="links that contradict each other yield one by one: the sum is least, not that of squares")  # fmt: skip
 def _contradiction() -> Findings:
     x = np.array([[0.0, 0], [1, 0], [0.5, 0.3]])
     link = Distance([[0, 2], [2, 1], [0, 1]], [1.0, 1.0, 3.0])

@@ -134,7 +134,7 @@ def _too_taut() -> Scenes:
         yield f"{count} points", particles, [Gravity(G), Distance(pairs)], {"precision": "f64", "only": (n,), "least": 2}
 
 
-@passive(72, "the same of Rope, upright, leaning, and 0.1 and 10 % too short", gain=0.0, speed=2.0, softened=True)
+@passive(72, "the same of Rope, upright, leaning, and 0.1 and 10 % too short", gain=1e-4, speed=2.0, softened=True)
 def _short() -> Scenes:
     for rest in (1.0, 0.999, 0.9):
         particles, pairs, length = ropes((40, 20, 20), [(1.0, 0.0), (0.0, 1.0), (0.7, 0.7)], rest)
@@ -209,7 +209,7 @@ def _twice() -> Scenes:
         yield "length 0", hung, [Gravity(G), zero], {"precision": "f64", "solver": solver, "iterations": passes}
 
 
-@passive(77, "rigid clusters that share three points, and one with links inside", gain=1e-3, speed=2.0)
+@passive(77, "rigid clusters that share three points, and one with links inside", gain=8e-4, speed=2.0)
 def _clusters() -> Scenes:
     x, pairs = grid(3, 5)
     k = np.arange(15).reshape(3, 5).T
