@@ -10,7 +10,6 @@ from tiverlet.solvers.redundancy import implied_links
 
 from .scenes.solving import STRUCTURES, hung
 
-
 GAINS = pytest.mark.xfail(strict=True, reason="what yields in a straight ladder of bars gives back more than it took, flagged")
 
 
