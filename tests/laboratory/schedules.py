@@ -11,6 +11,7 @@ from tiverlet.report.output import Table
 from ..fuzz import oracles
 from ..fuzz.scenes import Structure
 from ..fuzz.trials import RISKS, Refused, Trial
+from ..ledger.runs import extent, has_links
 from ..properties import SCHEDULES, scheduled
 from ..scenes import SCENES
 from ..scenes.scene import Scene
@@ -19,7 +20,6 @@ SOLVERS = {
     "default": None, "Direct": tv.Direct(), "Jacobi": tv.Jacobi(), "ConjugateGradient(5)": tv.ConjugateGradient(5),
     "Chebyshev": tv.Chebyshev(),
 }  # fmt: skip
-LINKS = {"Distance", "Rope", "Spacer", "Bend", "ShapeMatch", "Area", "Volume", "Motor", "Winch", "AngleLimit", "Dihedral"}
 MOST = 1e-3  # of the heights that are passed and the kinetic energy at the start: a gain that counts
 NOTES = [
     "Scenes that gain a thousandth of the heights that they pass and of their first kinetic energy, of all passive scenes with",
@@ -30,8 +30,8 @@ NOTES = [
 def main(args) -> Iterator[Table]:
     """Yield the table of solvers and schedules, and that of the scenes that gain."""
     tv.init(threads=1)
-    linked = {name: s for name, s in SCENES.items() if LINKS & {call.name for call in s.structure.features}}
-    some = {name: s for name, s in linked.items() if oracles.passive(s.structure) and (not args.parts or name in args.parts)}
+    passive = {name: s for name, s in SCENES.items() if has_links(s) and oracles.passive(s.structure)}
+    some = {name: s for name, s in passive.items() if not args.parts or name in args.parts}
     cells, gains = [], []
     for solver in SOLVERS:
         found = [row for name, scene in some.items() for row in gained(name, scene, solver)]
@@ -67,11 +67,3 @@ def gained(name: str, scene: Scene, solver: str) -> Iterator[tuple]:
                 flags = set().union(*(r.flags for r in reports)) & {*RISKS, "energy-gain", "non-finite", "out-of-range"}
                 size = extent(trial, np.array(places))
                 yield name, label, share / size if size else 0.0, ", ".join(sorted(flags))
-
-
-def extent(trial: Trial, places: np.ndarray) -> float:
-    """Return the weight times the heights that are passed, and the kinetic energy at the start [J]."""
-    p, m = trial.world.particles, np.where(trial.free > 0, trial.world.particles.mass, 0.0)
-    low, high = places.min(axis=(0, 1)), places.max(axis=(0, 1))
-    height = oracles.height(trial.features, p, trial.free, low, np.maximum(high, low + p.size))
-    return float(height + m @ (p.velocity**2).sum(axis=1) / 2)

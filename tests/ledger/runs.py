@@ -132,6 +132,24 @@ def of_case(case: Case) -> Iterator[Cell]:
                 yield from reported(how, column, reports, floor)
 
 
+def has_links(scene: Scene) -> bool:
+    """Return whether a scene has constraints, which a solver solves."""
+    return any(issubclass(getattr(tv, call.name), Batch) for call in scene.structure.features)
+
+
+def extent(trial: Trial, places: np.ndarray) -> float:
+    """Return the weight times the heights that are passed, and the kinetic energy at the start [J].
+
+    places: (frames, n, dim), the positions at the ends of frames.
+    """
+    p, m = trial.world.particles, np.where(trial.free > 0, trial.world.particles.mass, 0.0)
+    v = np.broadcast_to(np.asarray(trial.structure.particles.args.get("velocity", 0.0)), places[0].shape)
+    finite = np.isfinite(places).all(axis=(1, 2))
+    low, high = places[finite].min(axis=(0, 1)), places[finite].max(axis=(0, 1))
+    height = oracles.height(trial.features, p, trial.free, low, np.maximum(high, low + p.size))
+    return height + m @ (v**2).sum(axis=1) / 2
+
+
 def of_scene(scene: Scene) -> Iterator[Cell]:
     """Yield the figures of a scene of the catalogue."""
 
@@ -144,9 +162,8 @@ def of_scene(scene: Scene) -> Iterator[Cell]:
     def build(method: str, precision: str, path: str = "fused") -> tv.World:
         return with_(method, precision, path).build()[0]
 
-    linked = any(issubclass(getattr(tv, call.name), Batch) for call in scene.structure.features)
     end: Any = None
-    for method, precision in ways(build, SOLVERS if linked else ()):
+    for method, precision in ways(build, SOLVERS if has_links(scene) else ()):
         how = f"{method} {precision}"
         with contextlib.closing(Trial(with_(method, precision))) as trial:
             if method == "default" and precision == "f32":
@@ -194,9 +211,7 @@ def seen_in(trial: Trial, how: str, column: str, seen: list[tuple], floor: float
     energies = np.array([reports[0].energy - reports[0].energy_change, *(r.energy for r in reports)])
     v = np.broadcast_to(np.asarray(structure.particles.args.get("velocity", 0.0)), places[0].shape)
     m = np.where(trial.free > 0, p.mass, 0.0)
-    finite = np.isfinite(places).all(axis=(1, 2))
-    low, high = places[finite].min(axis=(0, 1)), places[finite].max(axis=(0, 1))
-    size = oracles.height(trial.features, p, trial.free, low, np.maximum(high, low + p.size)) + m @ (v**2).sum(axis=1) / 2
+    size = extent(trial, places)
     if oracles.passive(structure):
         # The largest rise since any earlier frame, in the heights that are passed and the motion at the start.
         rise = np.nan_to_num(energies - np.minimum.accumulate(energies), nan=np.inf) / (size or abs(energies[0]) or 1.0)
