@@ -51,7 +51,7 @@ class World:
     are not resolved, and lose what they vibrate with (flag "energy-loss"). iterations: passes over the constraints in each
     substep. Both may change at any time, without compiling.
     solver: how constraints are solved: Direct for chains, trees and loops; Jacobi, Chebyshev or ConjugateGradient for cloth. None
-    chooses ConjugateGradient(5) where elimination would leave many stiff links to Jacobi, as in cloth; else Direct where
+    chooses ConjugateGradient where elimination would leave many stiff links to Jacobi, as in cloth; else Direct where
     constraints are connected like chains or beams; else Jacobi. explain() reports the choice and its reason.
     precision: "f32" (for position and displacement; a coordinate is resolved to 6e-8 of its value: 1 mm at 10 km and 6 cm at 1000
     km), "f32-compensated" (the position has a low word, which keeps 1e-4 m at any of these distances), "f64". Where constraints

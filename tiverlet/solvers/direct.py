@@ -68,9 +68,8 @@ class Direct(Solver):
     f64 in every world, because its pivots span the mass ratio.
 
     A load that cannot be borne to first order (a straight rope between two pins) leaves the tension undetermined with directions
-    at the start of the substep. Such a system is solved with directions at the end, where links yield at (omega h)^2 = 1; so is
-    one with a transverse (omega h)^2 > 4. It gives way and loses energy, with the flag "softened", see
-    tiverlet/solvers/README.md.
+    at the start of the substep. In such a system links yield at (omega h)^2 = 1, with directions at the end where they pull; so
+    they do in one with a transverse (omega h)^2 > 4. It gives way, with the flag "softened", see tiverlet/solvers/README.md.
     """
 
     converges = True
@@ -806,8 +805,8 @@ class Elimination(System):
         """Find the steps of all multipliers in system b. kick: how many kicks they supply: 1, except at a start.
 
         Particles under tension vibrate transversely. If the substep is too long for that, or the tension is undetermined (see
-        Direct), the system is solved with directions at the end of the substep, and rows yield, see let_yield(). If an earlier
-        pass found a larger tension, that would take most of it back, along other directions; then the system takes no step.
+        Direct), links yield, see let_yield(). If an earlier pass found a larger tension, that would take most of it back, along
+        other directions; then the system takes no step.
         """
         begin, end = self.part_begin[b], self.part_begin[b + 1]
         if ti.static(self.sleeps):
@@ -839,7 +838,7 @@ class Elimination(System):
                 continue
             if ti.static(self.answers):
                 self.added[b] = softness
-                if hard != 0 or stage == GIVE_WAY:  # answers to moves in f32 would be their rounding over a pivot
+                if hard != 0 or gives_way:  # answers to moves in f32 would be their rounding over a pivot
                     for r in range(begin, end):
                         self.added[b] = ti.max(self.added[b], self.small_pivot[r])
             tension, pull, total = self.tensions(begin, end, ti.cast(stage >= COMPARE, ti.i32), longer)
