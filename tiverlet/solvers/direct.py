@@ -24,7 +24,7 @@ CONTRADICTION = 1e-6  # of its violation: a redundant constraint with a smaller 
 SMALL_PIVOT = 2e-3  # of the contribution of its heaviest particle: below, a load is hardly borne to first order
 AGREEMENT = 0.25  # of the tension: how far solutions with directions at the two ends of the substep may differ there
 STABLE = 2.0  # (omega h)^2 that is allowed there: half the limit of stability
-ROUNDS = 12  # at most, in search of the rows that are at bounds
+PATIENCE = 3  # rounds of an active set that may leave as many rows misplaced as one before, until they move one by one
 
 # A system takes a second Newton step if a particle moved by more than the square root of LONG_MOVE, in lengths, unless a tension
 # was above CALM_TENSION, (omega h)^2. Such vibrations are not resolved and gain energy; the error of the first step removes it.
@@ -33,7 +33,7 @@ UNKNOWN, UNMET, ENDED = range(3)  # whether a system takes it: decided by the mo
 
 # (omega h)^2 at which rows yield. A pull then is a step down the gradient of a convex energy, sum lam |r|, see let_yield().
 YIELD = 1.0
-LEAST_SOFTNESS, SOFTER = 1e-9, 100.0  # of the largest diagonal, so that no pivot vanishes; and the factor of a next try
+LEAST_SOFTNESS, SOFTER = 1e-6, 100.0  # of the largest diagonal, above what rounding throws; and the factor of a next try
 # Strain up to which giving way is not told where no tension bears the load: a straight rope so much longer sags by 0.3 %.
 SLIGHT = 2e-5
 UNBORNE = 1e30  # (omega h)^2 of a tension that is undetermined
@@ -574,33 +574,51 @@ class Elimination(System):
         return out
 
     @ti.func
-    def update_active_set(self, begin, end, at_end):
-        """Move misplaced rows to the bounds that they have passed, or off theirs. Returns whether any was."""
-        found = False
+    def count_misplaced(self, begin, end, at_end):
+        """Find what the steps leave of violations. Returns the number of rows that are misplaced."""
+        count = 0
         for r in range(begin, end):
             self.remaining[r] = 0
             for q in range(self.product_begin[r], self.product_begin[r + 1]):
                 at = self.product[q]
                 self.remaining[r] = self.remaining[r] + self.scale[r] * self.coupling(at, at_end) * self.step[self.row_of[at[2]]]
-            if self.is_misplaced(r):
-                found = True
+            count += ti.cast(self.is_misplaced(r), ti.i32)
+        return count
+
+    @ti.func
+    def move_misplaced(self, begin, end, all_of_them):
+        """Move misplaced rows, or the last of them, to the bounds that they have passed, or off theirs."""
+        done = False
+        for k in range(end - begin):
+            r = end - 1 - k
+            if not done and self.is_misplaced(r):
+                done = not all_of_them
                 self.active[r] = 1 - self.active[r]
                 if self.active[r] == 0:
                     self.bound[r] = self.nearest_bound(r, self.lam[r] + self.step[r])
-        return found
 
     @ti.func
     def solve_active_set(self, begin, end, softness, at_end, gives_way):
-        """Find the steps of all rows that act, by an active set. Returns the result of eliminate(), and whether it was found."""
+        """Find the steps of all rows that act, by an active set. Returns the result of eliminate(), and whether it was found.
+
+        All misplaced rows move at once, as long as their number falls; then the last one alone, by which the set is found for any
+        matrix with positive principal minors (Judice and Pires 1994). The search ends early only where rounding hides that.
+        """
         hard, k, bounded, found = 0, 0, gives_way or ti.static(self.bounds), False
-        while k < ROUNDS and not found:
+        fewest, patience = end - begin + 1, PATIENCE
+        while k < 2 * (end - begin) + 8 and not found:
             self.assemble(begin, end, softness, at_end)
             now = self.eliminate(begin, end)
             hard = ti.max(now, ti.select(hard == 2, 2, 0))  # a contradiction is kept: its row may be switched off next
             k += 1
             found = True
             if bounded:
-                found = not self.update_active_set(begin, end, at_end)
+                count = self.count_misplaced(begin, end, at_end)
+                found = count == 0
+                patience = ti.select(count < fewest, PATIENCE, patience - 1)
+                fewest = ti.min(fewest, count)
+                if not found:
+                    self.move_misplaced(begin, end, patience >= 0)
         if bounded:
             for r in range(begin, end):
                 if self.scale[r] != 0:
@@ -816,7 +834,7 @@ class Elimination(System):
             if begin < end:
                 self.begin_bodies(b, begin, end)
         zero = ti.cast(0, ti.f64)
-        softness, tension_at_start, total_at_start, reported = zero, zero, zero, zero
+        softness, stiffest, tension_at_start, total_at_start, reported = zero, zero, zero, zero, zero
         stage, bound, soft, longer = FORWARD, True, self.softness(b, begin, end), 1 + zero
         if soft > 0:
             longer = soft / kick
@@ -831,7 +849,7 @@ class Elimination(System):
             at_end, gives_way = ti.cast(stage == COMPARE, ti.i32), stage == GIVE_WAY
             hard, found = self.solve_active_set(begin, end, softness, at_end, gives_way)
             found = found and (not gives_way or longer * self.unlimited_tension(begin, end) <= YIELD)
-            if gives_way and not found and softness < self.largest_diagonal(begin, end):
+            if gives_way and not found and softness < stiffest:
                 softness *= SOFTER
                 for r in range(begin, end):
                     self.begin_row(r)
@@ -889,8 +907,10 @@ class Elimination(System):
                 stage = DONE
             if stage == GIVE_WAY:
                 self.end_newton(b)
+                stiffest = self.largest_diagonal(begin, end)
+                softness = LEAST_SOFTNESS * stiffest
+                self.solve_active_set(begin, end, softness, 1, False)  # where pivots vanish, the signs found so far are rounding
                 self.let_yield(begin, end, longer)
-                softness = LEAST_SOFTNESS * self.largest_diagonal(begin, end)
         if ti.static(bool(self.joined)):
             if begin < end:
                 self.joined.follow(b, self)
