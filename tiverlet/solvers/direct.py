@@ -33,7 +33,7 @@ UNKNOWN, UNMET, ENDED = range(3)  # whether a system takes it: decided by the mo
 
 # (omega h)^2 at which rows yield. A pull then is a step down the gradient of a convex energy, sum lam |r|, see let_yield().
 YIELD = 1.0
-LEAST_SOFTNESS, SOFTER = 1e-6, 100.0  # of the largest diagonal, above what rounding throws; and the factor of a next try
+LEAST_SOFTNESS, SOFTER = 1e-9, 100.0  # of the largest diagonal, but no less than rounding; and the factor of a next try
 # Strain up to which giving way is not told where no tension bears the load: a straight rope so much longer sags by 0.3 %.
 SLIGHT = 2e-5
 UNBORNE = 1e30  # (omega h)^2 of a tension that is undetermined
@@ -908,7 +908,7 @@ class Elimination(System):
             if stage == GIVE_WAY:
                 self.end_newton(b)
                 stiffest = self.largest_diagonal(begin, end)
-                softness = LEAST_SOFTNESS * stiffest
+                softness = ti.max(LEAST_SOFTNESS, 2 * self.epsilon) * stiffest
                 self.solve_active_set(begin, end, softness, 1, False)  # where pivots vanish, the signs found so far are rounding
                 self.let_yield(begin, end, longer)
         if ti.static(bool(self.joined)):
