@@ -45,9 +45,10 @@ PATCHED = "sharing" in enabled
 collect_ignore = [] if PATCHED else ["test_compiling.py", "test_sharing.py"]  # these files test the patches
 # Files that take longest run first: otherwise one worker would still run one of them when the others are done.
 LONG = (
-    "matrix", "touching_scenes", "scenes", "cases", "walls", "knobs", "edits", "worlds", "properties", "pictures", "answers",
-    "statics", "polygons", "impacts", "body_impacts", "rows", "recordings", "velocity", "guard", "reported_loads", "periodic",
-    "determinism", "direct", "sharing", "bodies", "placing", "pairs", "demos", "softness", "sleep", "solvers", "order", "docs",
+    "matrix", "touching_scenes", "scenes", "advice", "cases", "walls", "knobs", "edits", "worlds", "properties", "pictures",
+    "answers", "statics", "polygons", "impacts", "body_impacts", "rows", "recordings", "velocity", "guard", "reported_loads",
+    "periodic", "determinism", "direct", "sharing", "bodies", "placing", "pairs", "demos", "softness", "sleep", "solvers",
+    "order", "docs",
 )  # fmt: skip
 ARCH = os.environ.get("TIVERLET_ARCH", "cpu")
 SOURCES = str(pathlib.Path(tv.__file__).parent)

@@ -90,6 +90,6 @@ def test_springs_that_a_solver_softens_are_told(world):
 
     report = told()
     assert report.flags == {"softened"} and "by 23" in report.notes[0]
-    need = int(re.findall(r"Use up to (\d+) substeps", report.notes[0])[0])
+    need = int(re.findall(r"Use about (\d+) substeps", report.notes[0])[0])
     assert "softened" in told(need - 6).flags and told(need).clean and need == 44
     assert told(solver=None).clean and told(strain=3e-4).clean and "softened" in told(strain=8e-4).flags

@@ -42,3 +42,7 @@ class Radii:
     def stride(self, i):
         """Return the longest step with which particle i cannot pass another: two such steps never exceed r_i + r_j."""
         return (ti.cast(self.discs, self.real) * self.of(i) + ti.cast(self.least, self.real)) / 2
+
+    def strides(self, radius: np.ndarray) -> np.ndarray:
+        """Return stride() of particles of these radii, (n,) [m]."""
+        return (self.discs * radius + self.least) / 2

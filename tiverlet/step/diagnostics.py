@@ -10,8 +10,10 @@ from ..device import runtime, ti
 from ..device.number import OnDevice
 from ..device.thread_team import LEAST
 from ..features.feature import FAR
+from ..forces.gravity import Gravity
 from ..neighbours.cell_list import FARTHEST
 from ..particles import LARGEST
+from ..solvers.direct import SLIGHT
 from ..solvers.slots import TENSEST
 from ..solvers.solver import Solver
 from .force_stiffness import ForceStiffness
@@ -385,7 +387,9 @@ class Reporter:
             self.n, self.farthest, bad, reach, fast, overlap, pressed, turned, moved, tension, soft, stiff, released, residual
         ).items():  # fmt: skip
             if there:
-                notes[flag] = self._note(flag, first, reach, overlap, moved, tension, soft, stiff, released, residual, substeps)
+                notes[flag] = self._note(
+                    flag, first, reach, overlap, moved, tension, soft, stiff, released, residual, substeps, h
+                )
         damped = () if notes else self._damped(residual, substeps)
         report = StepReport.of(
             {
@@ -424,11 +428,54 @@ class Reporter:
             f"loses energy and angular momentum. Use up to {need:.7g} substeps, or more steps of the solver.",
         )
 
+    def _fastest_move(self) -> float:
+        """Return the longest move in the last substep, relative to the longest with which a particle passes no other."""
+        d = self.scene.memory.read(self.scene.state.d)[: self.n].astype(np.float64)
+        way, worst = np.linalg.norm(d, axis=1), 0.0
+        for geometry in (c.dev.geometry for c in self._step.contacts):
+            limit = geometry.radius.strides(self.scene.particles.radius)
+            worst = max(worst, float((way / np.minimum(limit, getattr(geometry, "stride", np.inf))).max(initial=0.0)))
+        return worst
+
+    def _passed(self, overlap: float, moved: float, substeps: int) -> str:
+        """Return what to do about particles that may have passed others. moved: by what they were placed."""
+        far = max(self._fastest_move(), overlap)  # both of order h
+        placed = moved > self.scene.particles.radius.min(initial=np.inf)
+        why = (
+            "Particles were moved past others to where their rigid constraints are met: only other places help. "
+            if placed
+            else ""
+        )
+        if placed and far <= 1:
+            return why.strip()
+        return (
+            f"{why}A particle moved by more than its own size in one substep, or got deeper into a body than its middle, and may "
+            f"have passed it. Use more substeps, at first {np.ceil(substeps * max(far, 2)):.7g}."  # the fastest may have stopped
+        )
+
+    def _rounding(self, reach: float) -> float:
+        """Return what coordinates up to `reach` are rounded to in f32 [m]; 0 in other precisions."""
+        single = self.scene.real == ti.f32 and not self.scene.state.compensated
+        return float(np.spacing(np.float32(reach))) if single else 0.0
+
+    def rounds_loads(self, reach: float, h: float) -> str:
+        """Return what to do besides, where gravity moves particles by less in a substep than coordinates are rounded to; else "".
+
+        There, the directions in which straight ropes and flat nets would carry it are rounding.
+        """
+        forces = self._step.integrator.forces.all
+        fall = sum(float(np.linalg.norm(f.kernel_values()["g"])) for f in forces if isinstance(f, Gravity)) * h * h
+        rounding = self._rounding(reach)
+        if not 0 < fall < rounding:
+            return ""
+        return (
+            f" Loads move particles by {fall:.2g} m in a substep, and coordinates are rounded to {rounding:.2g} m in f32: use "
+            'precision="f64", too.'
+        )
+
     def _less_overlap(self, reach: float, overlap: float, substeps: int) -> str:
         """Return what to do about an overlap, relative to a radius."""
-        radius = self.scene.particles.radius
-        single = self.scene.real == ti.f32 and not self.scene.state.compensated
-        rounding = float(np.spacing(np.float32(reach))) if single else 0.0
+        radius, rounding = self.scene.particles.radius, self._rounding(reach)
         if rounding > ROUGH * overlap * radius[radius > 0].min(initial=np.inf):
             return (
                 f"Coordinates of {reach:g} m are rounded to {rounding:.2g} m in f32: shift the scene towards the origin, or use "
@@ -439,7 +486,7 @@ class Reporter:
         placed = f"; what was placed so parts at push_out = {max(given):g} m/s" if given else ""
         return f"Use up to {need:.7g} substeps{placed}. Where they do not help, there is less room than particles need."
 
-    def _note(self, flag, first, reach, overlap, moved, tension, soft, stiff, released, residual, substeps) -> str:
+    def _note(self, flag, first, reach, overlap, moved, tension, soft, stiff, released, residual, substeps, h) -> str:
         """Return the note of a flag: its meaning and a remedy, with the figures of this frame."""
         if flag == "non-finite":
             return (
@@ -449,10 +496,7 @@ class Reporter:
         if flag == "out-of-range":
             return f"A coordinate is out of range: it reached {reach:g} m, and beyond {self.farthest:g} m the precision fails."
         if flag == "tunnelling-risk":
-            return (
-                "A particle moved by more than its own size in one substep, or got deeper into a body than its middle, and "
-                "may have passed it; use more substeps."
-            )
+            return self._passed(overlap, moved, substeps)
         if flag == "compressed":
             return (
                 f"Contacts are pressed or thrown together by more than they hold: the worst overlaps by {100 * overlap:.3g} % "
@@ -462,7 +506,7 @@ class Reporter:
         if flag == "turned":
             return (
                 "A constraint turned by more than 41 degrees in one substep; it is damped there, or, as a soft spring, pulls and "
-                "pushes as before it turned. Use more substeps."
+                f"pushes as before it turned. Use more substeps, at first {2 * substeps}."
             )
         if flag == "moved":
             return (
@@ -470,22 +514,25 @@ class Reporter:
                 "to where these are met. Place them there, or give the constraints other rest values, or compliance."
             )
         if flag == "softened" and tension > TENSEST:
-            need = np.ceil(substeps * np.sqrt(tension / STIFF))  # may be infinite
-            return (
+            return (  # the numbers may be infinite
                 f"A tension makes particles vibrate too fast for the substep: omega h >= {np.sqrt(tension):.3g}, stable below 2. "
-                f"Its constraints give way instead. Use about {need:.7g} substeps."
+                f"Its constraints give way instead. Use {more(substeps, tension / TENSEST, 2)}.{self.rounds_loads(reach, h)}"
             )
         if flag == "softened" and tension < TENSEST:
-            need = np.ceil(substeps * np.sqrt(soft / TOO_SOFT))  # of order h^2, or less where a floor of conjugate gradients acts
-            return (
+            return (  # of order h^2, or less where a floor of conjugate gradients acts
                 f"Springs are softer than their compliance says, by {100 * soft:.3g} % (weighted by their energy): the solver "
                 "leaves violations as large. Lengths are off by so much, and loads where they come of lengths, as in a net "
-                f"stretched between pins. Use up to {need:.7g} substeps, or compliance=0 for what is meant to be rigid."
+                f"stretched between pins. Use {more(substeps, soft / TOO_SOFT, 2)}, or compliance=0 for what is meant to be "
+                "rigid."
             )
         if flag == "softened":
+            # It is told until they give way by less than SLIGHT of their size: by the square of the slope that they sag to. What
+            # they gave way by within the frame may be gone at its end.
             return (
                 "A load has hardly a direction to be carried in, as that of a straight rope between two pins: its constraints "
-                "give way and sag with h^2. Give them slack or compliance, or use more substeps."
+                "give way and sag with h^2. Give them slack or compliance, or use "
+                f"{more(substeps, max(residual / SLIGHT, 16), 4)}, with which they sag too little to be told."
+                f"{self.rounds_loads(reach, h)}"
             )
         if flag == "stiff-force":
             need = np.ceil(substeps * np.sqrt(stiff / STIFF)) + 1
@@ -508,6 +555,16 @@ class Reporter:
             f"Constraints are not met: the worst is off by {100 * residual:.3g} % of its size. "
             f"Use about {need:.7g} substeps{other}. Where neither helps, constraints contradict each other."
         )
+
+
+def more(substeps: int, times: float, order: int) -> str:
+    """Return how many substeps lower a figure, which is `times` as large as it may be, below that.
+
+    A load F gives it the order h^order; a blow, of a given impulse F h, half of that. A blow at another time in the substep gives
+    another figure, up to the worst one, so that less than twice as many may change nothing.
+    """
+    about, blow = (np.floor(substeps * times ** (k / order)) + 1 for k in (1, 2))
+    return f"about {about:.7g} substeps, or up to {max(blow, 2 * substeps):.7g} substeps after a blow"
 
 
 def risks(

@@ -54,9 +54,11 @@ def checked(world: "World", report: StepReport) -> StepReport:
     gain = report.energy - energy_limit(bound, clock.kinetic, report.energy)
     if not spurious_gain(world, np.array([gain]), world._runner.sheet[None])[0]:
         return report
+    rounded = world._runner.diagnostics.report.rounds_loads(float(world._runner.sheet[REACH]), clock.h)
     note = (
         f"Nothing works on the scene, but it has {report.energy - bound:.3g} J more than it had; its kinetic energy was "
         f"{clock.kinetic:.3g} J at most. Use more substeps, at first {2 * report.substeps}, or soften what is stiff and heavy."
+        f"{rounded}"
     )
     return replace(report, flags=report.flags | {GAIN}, notes=(*report.notes, note))
 
