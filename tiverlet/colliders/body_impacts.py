@@ -11,9 +11,14 @@ if TYPE_CHECKING:
 # impulses propagate from link to link. One or two do where a system solves them exactly, and most of MANY have little to do.
 FEW, MANY = 8, 32
 MET = 2.0**-9  # of the first push: a smaller error of the normal displacement counts as met
+ALONG = 0.99  # cosine between normals up to which what is left of a wall's depth is that of the same wall: 8 degrees
+FULL = 1e-3  # of its bound: friction that is so near to it is all that there is
+SLIPS, FAST = 1 / 64, 2.0  # of a push: less slip is what passes lack; what comes to touch with more slides at once
+RESTS = False  # whether walls also hold bodies that rest in these passes, not only those that strike
 FELT = 2.0**-20  # of a squared displacement: a smaller change is no impact
 # What holds a particle that can move: rigid clusters that share particles, links, or a rigid cluster that shares none.
 IN_SHARED, LINKED, IN_CLUSTER = 1, 2, 3
+STUCK, SLID = 1, 2
 STRUCK_NOW, STRUCK_BEFORE = 1, 2  # a particle is struck: in the pass in which it meets the wall or particle, and in later passes
 
 
@@ -51,13 +56,14 @@ class BodyImpacts:
     particle is corrected, p' = max(p + t - d.n, 0).
 
     Constraints take into account that the wall will do that: while p > 0, they have their gradients at the particle, and so its
-    part in the matrix, without the direction of the normal. So one pass suffices where they are solved exactly, for any body and
+    part in the matrix, without the direction of the normal, and without any where it sticks. So one pass suffices where they are
+    solved exactly, for any body and
     any number of struck particles; there is another one if a particle was struck by it or came free, and for e > 0, until what is
     left of second order is small. A wall that would have to pull, p < 0, does so until the next pass, in which constraints take
     into account that it lets go; at once, it would throw its particle as far as it has to hold it. What the last pass leaves is
     lost. All impacts of a substep together are Newton's law for a rigid body. At e = 1 energy is conserved to O(h) in an impact,
     since a body turns in a substep, and to O(h^2) if it is a cluster. Friction holds the tangential displacement by up to its
-    coefficient times p.
+    coefficient times p: the static one where the particle stuck before, the dynamic one where it slid, until that would push it.
 
     These passes leave the violations that the regular passes left, and those of springs: removed all at once, they would become
     speed. Contacts, outlines, places, and clusters that share particles wait for the next substep. A particle that approaches by
@@ -75,7 +81,7 @@ class BodyImpacts:
         self.spreads = not system  # from link to link; a system solves all links at once
         self.exact = is_exact(scene, [b for b in batches if not b.clusters])
         self.leaves = not self.exact  # regular passes leave violations
-        self.stops = stops_bodies(scene, batches)
+        self.stops, self.rests = stops_bodies(scene, batches), RESTS
         n, dim, add = scene.count, scene.particles.dim, scene.memory.field
         self.state = scene.state
         self.rigid = add("impacts.rigid", n, kind=ti.i32)  # IN_SHARED, LINKED, IN_CLUSTER, or 0
@@ -83,7 +89,13 @@ class BodyImpacts:
         self.normal, self.moved = add("impacts.normal", n, width=dim), add("impacts.wall_moved", n, width=dim)
         self.coefficients = add("impacts.friction", n, width=2)
         self.target, self.pushed, self.first_push = (add(f"impacts.{k}", n) for k in ("target", "pushed", "first_push"))
-        self.held = add("impacts.held", n, width=dim)  # by friction
+        self.held, self.sticks = add("impacts.held", n, width=dim), add("impacts.sticks", n, kind=ti.i32)  # by friction
+        # Of the last substep: what friction took, the push, and whether the particle STUCK or SLID; 0 where none struck it.
+        self.braked, self.pushed_before = (
+            add("impacts.braked", n, width=dim, state=True),
+            add("impacts.pushed_before", n, state=True),
+        )
+        self.slides = add("impacts.slides", n, kind=ti.i32, state=True)
         self.bends = any(b.clusters for b in batches)
         if self.bends:
             self.bend = add("impacts.bend", n)  # of the path of a particle of a cluster along the normal, see ClusterImpact [m]
@@ -135,10 +147,38 @@ class BodyImpacts:
         self.struck[i] = self.reached[i] = 0
 
     @ti.func
-    def clear_requests(self):
-        """At the start of a substep: request no passes beside the regular ones."""
+    def note_slip(self, i):
+        """At the end of a substep: note if particle i slides: with all of its friction, and other than by what passes lack."""
+        slides, struck = False, self.struck[i] != 0
+        self.braked[i], self.pushed_before[i] = ti.zero(self.held[i]), ti.zero(self.pushed[i])
+        if struck and self.pushed[i] > 0:
+            d = self.state.d[i] - self.moved[i]
+            slip = (d - d.dot(self.normal[i]) * self.normal[i]).norm()
+            bound = self.friction_bound(i, self.held[i])
+            full = self.held[i].norm() >= ti.static(1 - FULL) * bound * self.pushed[i]
+            brakes = self.slides[i] == SLID and bound < self.coefficients[i][0]
+            slides = full and (brakes or slip > ti.static(SLIPS) * self.first_push[i])
+            self.braked[i], self.pushed_before[i] = self.held[i], self.pushed[i]
+        self.slides[i] = ti.select(struck, ti.select(slides, SLID, STUCK), 0)
+
+    @ti.func
+    def friction_bound(self, i, held):
+        """Return the coefficient of friction of particle i where friction takes `held` of its displacement."""
+        brakes = self.slides[i] == SLID and not held.dot(self.braked[i]) < 0  # else it brakes no more, but holds
+        return ti.select(brakes, self.coefficients[i][1], self.coefficients[i][0])
+
+    @ti.func
+    def near_enough(self, i):
+        """Return the error of a displacement of particle i that counts as met: a part of its push, or rounding [m]."""
+        return ti.max(ti.static(MET) * self.first_push[i], 4 * self.state.digits(i))
+
+    @ti.func
+    def clear_requests(self, now):
+        """At the start of a substep: request no passes beside the regular ones; where none can follow, as if all were taken."""
         for k in range(ti.static(self.passes + 1)):
             self.open[k] = 0
+        if now.span.part < now.span.iterations:
+            self.open[ti.static(self.passes - 1)] = 1
 
     @ti.func
     def request_pass(self, now):
@@ -189,8 +229,9 @@ class BodyImpacts:
 
     @ti.func
     def held_part(self, i, g):
-        """Return the part of the gradient g, of particle i, along which a wall holds the particle."""
-        return ti.select(self.is_held(i), g.dot(self.normal[i]) * self.normal[i], 0 * g)
+        """Return the part of the gradient g, of particle i, along which a wall holds the particle: all of it where it sticks."""
+        part = ti.select(self.sticks[i] != 0, g, g.dot(self.normal[i]) * self.normal[i])
+        return ti.select(self.is_held(i), part, 0 * g)
 
     @ti.func
     def is_pulled(self, i):
@@ -220,11 +261,19 @@ class BodyImpacts:
             self.normal[i], self.moved[i], self.target[i] = n, moved, target
             self.pushed[i], self.first_push[i] = 0 * target, target - leaving
             self.coefficients[i] = [static, dynamic]
-            self.held[i] = ti.zero(n)
+            self.held[i], self.sticks[i] = ti.zero(n), 0
+            if self.slides[i] == 0:
+                d = self.state.d[i] - moved
+                self.slides[i] = ti.select((d - d.dot(n) * n).norm() > ti.static(FAST) * (target - leaving), SLID, STUCK)
             if ti.static(self.bends):
                 self.bend[i] = 0 * target
             self.log[i] = log
         return out
+
+    @ti.func
+    def answers(self, i, n):
+        """Whether particle i has its impulse from a wall with the normal n in this substep."""
+        return self.struck[i] == STRUCK_BEFORE and n.dot(self.normal[i]) > ti.static(ALONG)
 
     @ti.func
     def cancel_bounce(self, i, n):
@@ -249,7 +298,7 @@ class BodyImpacts:
             if ti.static(self.bends):
                 if self.struck[i] == STRUCK_BEFORE:  # it turns in a substep: second order is left
                     miss = self.target[i] + self.bend[i] - (self.state.d[i] - self.moved[i]).dot(self.normal[i])
-                    off = (miss > 0 or self.pushed[i] > 0) and ti.abs(miss) > ti.static(MET) * self.first_push[i]
+                    off = (miss > 0 or self.pushed[i] > 0) and ti.abs(miss) > self.near_enough(i)
         elif self.struck[i] != 0:
             n, d, last = self.normal[i], self.state.d[i] - self.moved[i], self.pushed[i]
             miss = self.target[i] - d.dot(n)
@@ -263,13 +312,19 @@ class BodyImpacts:
             self.pushed[i] = pushed
             off = off or (pushed > 0) != (last > 0)
             if ti.static(not self.exact) or self.target[i] > 0:
-                off = off or ti.abs(miss) > ti.static(MET) * self.first_push[i]
+                off = off or ti.abs(miss) > self.near_enough(i)
             self.log_push(i, change)
             held = self.held[i] + d - d.dot(n) * n
             size = held.norm()
             support = ti.max(pushed, 0)
-            if size > self.coefficients[i][0] * support:
-                held *= self.coefficients[i][1] * support / size
+            bound = self.friction_bound(i, held) * support
+            sticks = size <= bound and bound > 0
+            if not sticks and size > 0:
+                held *= bound / size
+            if self.coefficients[i][0] > 0:
+                off = off or sticks != (self.sticks[i] != 0)
+                off = off or (not sticks and (held - self.held[i]).norm() > self.near_enough(i))
+            self.sticks[i] = ti.cast(sticks, ti.i32)
             change -= held - self.held[i]
             self.held[i] = held
             self.state.shift(i, change)

@@ -188,11 +188,16 @@ class Surface:
                 gap, before = -depth - leaving, (self.state.before[i] - moved).dot(n)
                 if gap < 0 and gap >= -close and -before > ti.abs(before - leaving):
                     gap = 0 * gap
-                if gap >= 0 and leaving < 0 and mode != FRICTIONLESS:
-                    if self.is_linked(i):
-                        if self.defer_impact(i, n, moved, leaving, before, after):
-                            move, after = 0 * depth, leaving
-                    elif ti.static(self.has_restitution):
+                strikes = gap >= 0 and leaving < 0 and mode != FRICTIONLESS
+                if self.is_linked(i):
+                    if strikes or self.takes_rest(mode):
+                        end = leaving + move
+                        if self.defer_impact(i, n, moved, leaving, ti.select(strikes, before, 0 * before), ti.min(end, 0)):
+                            move, after = ti.max(end, 0), leaving  # what was inside before comes out without momentum
+                        elif self.is_answered(i, n):
+                            after = leaving
+                elif strikes:
+                    if ti.static(self.has_restitution):
                         rise, after, left = self.bounce(gap, leaving, before, after)
             if ti.static(self.has_log):
                 self.log.record(i, depth, n, after - leaving, -leaving, moved, h, rise > 0)
@@ -246,6 +251,19 @@ class Surface:
             out = self.impacts.is_struck_now(i)
         return out
 
+    @inline
+    def takes_rest(self, mode):
+        """Whether linked particles that rest on the wall take part in impacts of bodies."""
+        return (mode != FRICTIONLESS) & (self.has_impacts and self.impacts.rests)
+
+    @ti.func
+    def is_answered(self, i, n):
+        """Whether linked particle i has its impulse from a wall with the normal n: what is left moves it without momentum."""
+        out = False
+        if ti.static(self.has_impacts):
+            out = self.impacts.answers(i, n)
+        return out
+
     @ti.func
     def defer_impact(self, i, n, moved, leaving, before, after):
         """Whether linked particle i is left where it is in this pass, since it strikes the wall, and BodyImpacts pushes it.
@@ -259,7 +277,12 @@ class Surface:
             if ti.static(self.has_restitution):
                 if self.restitution[None] > 0:
                     bounces, target = True, -self.restitution[None] * before
-            bounces = bounces and -before > ti.static(SLOW) * ti.abs(before - leaving)
+            fast = -before > ti.static(SLOW) * ti.abs(before - leaving)
+            if ti.static(self.impacts.rests):
+                if not fast:
+                    bounces, target = ti.static(self.impacts.stops), after
+            else:
+                bounces = bounces and fast
             static = dynamic = 0 * target
             if ti.static(self.has_friction):
                 static, dynamic = self.static(), self.dynamic()

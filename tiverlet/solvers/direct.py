@@ -13,7 +13,7 @@ from .corners import corners_of
 from .elimination import Plan, plan
 from .joined import Joined, couples, joined_clusters
 from .redundancy import implied_links
-from .slots import TENSEST, Slots
+from .slots import SLIGHT, TENSEST, Slots
 from .solver import WIDTH, Solver
 from .system import REDUNDANT, SLACK, System, solvable
 
@@ -34,8 +34,6 @@ UNKNOWN, UNMET, ENDED = range(3)  # whether a system takes it: decided by the mo
 # (omega h)^2 at which rows yield. A pull then is a step down the gradient of a convex energy, sum lam |r|, see let_yield().
 YIELD = 1.0
 LEAST_SOFTNESS, SOFTER = 1e-9, 100.0  # of the largest diagonal, but no less than rounding; and the factor of a next try
-# Strain up to which giving way is not told where no tension bears the load: a straight rope so much longer sags by 0.3 %.
-SLIGHT = 2e-5
 UNBORNE = 1e30  # (omega h)^2 of a tension that is undetermined
 GONE = 0.1  # of its violations: what may be left of them a substep after they seem to have been removed
 SOFTENED = "system.softened"  # a field, by its name in recordings

@@ -16,6 +16,8 @@ from .system import solvable
 
 # Where constraints converge within a substep, SHAKE is an explicit method for transverse vibrations, with a limit of stability:
 TENSEST = 4.0  # (omega h)^2 of a transverse vibration under a tension, beyond which Verlet diverges
+# Strain up to which giving way is not told where no tension bears the load: a straight rope so much longer sags by 0.3 %.
+SLIGHT = 2e-5
 # Steps of the dither of moves, from a substep and from a pass to the next, times 2^32.
 DITHER = golden_steps(1, bits=32)[0], golden_steps(2, bits=32)[0]
 

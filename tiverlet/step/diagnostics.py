@@ -13,8 +13,7 @@ from ..features.feature import FAR
 from ..forces.gravity import Gravity
 from ..neighbours.cell_list import FARTHEST
 from ..particles import LARGEST
-from ..solvers.direct import SLIGHT
-from ..solvers.slots import TENSEST
+from ..solvers.slots import SLIGHT, TENSEST
 from ..solvers.solver import Solver
 from .force_stiffness import ForceStiffness
 from .integrator import STIFF

@@ -7,6 +7,7 @@ from ...geometry import rotation
 
 SWEEPS = 64  # over the particles that were struck, at most
 FIXED = 2.0**20  # mass of a particle that cannot move, in masses of its cluster: such a cluster turns about it
+TURNS = 1 / 4  # of a push: the radius of gyration that it sees at least; a thinner body would turn by more than 2 rad
 MET = 2.0**-12  # of the first push: a smaller change ends the sweeps
 
 
@@ -45,7 +46,7 @@ class ClusterImpact:
     def move_as_body(self, c, begin, end):
         """Push the particles of cluster c that struck, and write the moves of all of its corners."""
         i0, M, center = self.corners.reference_particle(c), ti.cast(0, ti.f64), self.cluster.zero_vector()
-        start = self.cluster.zero_vector()
+        start, far = self.cluster.zero_vector(), ti.cast(0, ti.f64)
         S = center.outer_product(center)
         for e in range(begin, end):
             m, r = self.cluster.mass_of(e, c, FIXED), self.cluster.relative_position(e, i0, 1)
@@ -53,6 +54,8 @@ class ClusterImpact:
             start += m * r
             center += m * self.cluster.relative_position(e, i0, 0)
             S += m * r.outer_product(r)
+            if self.impacts.struck[self.corners.members[e]] != 0:
+                far = ti.max(far, ti.static(TURNS) * self.impacts.first_push[self.corners.members[e]])
             self.count_push(e, -1)
         start, center = start / M, center / M
         S -= M * start.outer_product(start)
@@ -60,6 +63,17 @@ class ClusterImpact:
         W, off = 0 * rotation.axial(S), True
         turn = self.turn_so_far(c, begin, end, i0, start, S)
         self.aim_along_tangents(begin, end, i0, start, turn)
+        for k in ti.static(range(self.state.dim)):
+            S[k, k] += M * far * far
+        for e in range(begin, end):  # begin with the pushes of the last substep
+            i = self.corners.members[e]
+            if self.impacts.is_struck_now(i):
+                s = self.cluster.relative_position(e, i0, 1) - start
+                self.impacts.pushed[i], self.impacts.held[i] = self.impacts.pushed_before[i], self.impacts.braked[i]
+                change = ti.cast(self.impacts.pushed[i] * self.impacts.normal[i] - self.impacts.held[i], ti.f64)
+                push = self.cluster.mass_of(e, c, FIXED) * change
+                V += push / M
+                W += rotation.turn_rate(S, rotation.axial(push.outer_product(s)))
         for _ in range(SWEEPS):
             if off:
                 off = False
@@ -119,9 +133,10 @@ class ClusterImpact:
         if self.impacts.coefficients[i][0] > 0 and slip > 0:
             last = ti.cast(self.impacts.held[i], ti.f64)
             held = last + across / (m * self.give(s, across / slip, M, S))
-            size, most = held.norm(), ti.cast(self.impacts.coefficients[i] * self.impacts.pushed[i], ti.f64)
-            if size > most[0]:
-                held *= most[1] / size
+            bound = self.impacts.friction_bound(i, ti.cast(held, self.real)) * self.impacts.pushed[i]
+            size, most = held.norm(), ti.cast(bound, ti.f64)
+            if size > most:
+                held *= most / size
             self.impacts.held[i] = ti.cast(held, self.real)
             push -= held - last
         return m * push, ti.abs(self.impacts.pushed[i] - p)
