@@ -34,7 +34,7 @@ FAULTS = (
     Fault("0c60d46f", "near() and contacts read in the middle of a frame", "device/interrupts.py",
           "        _turns.acquire()", "        _turns.acquire() if get_ident() == self._main else None", "interrupts"),
     Fault("2e02d9a5", "steady changes of the substep settle nothing", "step/runner.py",
-          "return adapts or steady or bool(", "return adapts or bool(", "guard direct"),
+          "return adapts or (dt == clock.frame[1] and", "return adapts or (False and", "guard direct"),
     Fault("28b072a5", "what stays violated under auto is called good", "step/adaptive.py",
           'if tries.verdict == "good" and off > 1 else', 'if tries.verdict == "good" and off > 1e9 else',
           "softness"),

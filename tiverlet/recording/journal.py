@@ -30,7 +30,7 @@ from . import rrd
 if TYPE_CHECKING:
     from ..step.step_report import StepReport
 
-FORMAT = 12
+FORMAT = 13
 GUARD = {"stuck", "substeps-capped"}  # flags that depend on the StepController's failed tries, not on the recorded steps
 JOURNAL = "tiverlet/journal"
 SCENE = "world/scene"

@@ -34,7 +34,6 @@ UNKNOWN, UNMET, ENDED = range(3)  # whether a system takes it: decided by the mo
 # (omega h)^2 at which rows yield. A pull then is a step down the gradient of a convex energy, sum lam |r|, see let_yield().
 YIELD = 1.0
 LEAST_SOFTNESS, SOFTER = 1e-9, 100.0  # of the largest diagonal, but no less than rounding; and the factor of a next try
-UNBORNE = 1e30  # (omega h)^2 of a tension that is undetermined
 GONE = 0.1  # of its violations: what may be left of them a substep after they seem to have been removed
 SOFTENED = "system.softened"  # a field, by its name in recordings
 
@@ -130,11 +129,10 @@ class Elimination(System):
         row, corner, particle = self.corners(scalars, slots)
         self.plan, self.parts, self.entries = found, self.memory.number(found.parts), self.memory.number(len(found.column))
         self.solved, self.has_implied = self.memory.number(len(found.rows)), len(rows) > len(found.rows)
-        # Of each part that gave way in the last substep: (h' / h)^2 for the substep h' whose yield loads it has; the sum of its
-        # violations; the energy that these store with the multipliers found, times h^2; and (omega h)^2 of the tension that it
-        # would have borne, UNBORNE where none bears the load. Else 0. The first number is below 0 where the part seems to have
-        # borne its load, until its violations are seen to be gone.
-        self.softened = scene.memory.field(SOFTENED, found.parts, width=4, kind=ti.f64, state=True)
+        # Of each part that gave way in the last substep: (h' / h)^2 for the substep h' whose yield loads it has, below 0 where it
+        # seems to have borne its load, until its violations are seen to be gone; the sum of these; and the energy that they store
+        # with the multipliers found, times h^2. Else 0.
+        self.softened = scene.memory.field(SOFTENED, found.parts, width=3, kind=ti.f64, state=True)
         product = found.product.copy()
         product[:, 1:] = slot[product[:, 1:]]
         side = np.repeat([b.side for b in scalars], [b.count for b in scalars])[rows]
@@ -200,44 +198,29 @@ class Elimination(System):
             self.low = reals("low", values=np.where(side < 0, 0.0, -np.inf))
             self.high = reals("high", values=np.where(side > 0, 0.0, np.inf))
 
-    def keep_softness(self, ratio: float) -> None:
-        """Keep parts that give way as soft as they are, where the next substep is `ratio` times as long as the last one."""
+    def stiffen(self, factor: float) -> None:
+        """Let parts that give way bear tensions that are `factor` times as large, (omega h)^2, up to those of this substep."""
         state = self.memory.read(self.softened)
         if state.any():
-            soft, off, energy, tension = state.T
-            kept = np.copysign(np.maximum(np.abs(soft) / ratio**2, 1.0), soft) * (soft != 0)
-            self.memory.write(self.softened, np.stack([kept, off, energy * ratio**2, tension * ratio**2], axis=1))
-
-    def softness_of_longer(self, h: float) -> tuple[float, float]:
-        """Return (h' / h)^2 for the longest substep h' whose yield loads a part has, and the energy that such parts store in
-        substeps h [J]."""
-        soft, _, energy, _ = self.memory.read(self.softened).T
-        longer = np.abs(soft) > 1
-        return float(np.abs(soft).max(initial=1.0)), float(energy[longer].sum()) / h**2
-
-    def stiffen(self, factor: float) -> None:
-        """Let parts with the yield loads of a longer substep bear tensions that are `factor` times as large."""
-        state = self.memory.read(self.softened)
-        soft = np.abs(state[:, 0])
-        state[:, 0] = np.copysign(np.where(soft > 1, np.maximum(soft / factor, 1.0), soft), state[:, 0])
-        self.memory.write(self.softened, state)
-
-    def _can_stiffen(self) -> np.ndarray:
-        """Return a mask of the parts that gave way in a longer substep, and need not in this one, (parts,)."""
-        soft, _, _, tension = self.memory.read(self.softened).T
-        return (np.abs(soft) > 1) & (tension <= YIELD)
+            soft = state[:, 0]
+            state[:, 0] = np.copysign(np.maximum(np.abs(soft) / factor, 1.0), soft) * (soft != 0)
+            self.memory.write(self.softened, state)
 
     @property
-    def can_stiffen(self) -> bool:
-        """Whether parts gave way in a longer substep, and may bear their loads in this one."""
-        return bool(self._can_stiffen().any())
+    def softest(self) -> float:
+        """(h' / h)^2 for the longest substep h' whose yield loads a part has; 1 without any."""
+        return float(np.abs(self.memory.read(self.softened)[:, 0]).max(initial=1.0))
+
+    @property
+    def stored(self) -> float:
+        """The energy of parts with the yield loads of a longer substep, times h^2 of the last one."""
+        soft, _, energy = self.memory.read(self.softened).T
+        return float(energy[np.abs(soft) > 1].sum())
 
     def gives_way(self, batch: Batch) -> np.ndarray:
         """Return a mask of the constraints of a batch in parts that give way, (m,)."""
-        soft = (self.memory.read(self.softened)[:, 0] != 0) & ~self._can_stiffen()
-        parts = soft[self._part]
         row = self.row(batch)
-        return parts[row] & (row >= 0)
+        return (self.memory.read(self.softened)[self._part[row], 0] != 0) & (row >= 0)
 
     def forget(self, off: "Sequence[tuple[Batch, np.ndarray]]" = ()) -> None:
         """Forget which parts give way."""
@@ -745,7 +728,7 @@ class Elimination(System):
             self.softened[b][0] = ti.select(gives_way, ti.max(soft, 1 + 0 * soft), -soft)
             self.softened[b][2] = energy
         else:
-            self.softened[b] = ti.Vector.zero(ti.f64, 4)
+            self.softened[b] = ti.Vector.zero(ti.f64, 3)
 
     @ti.func
     def leave_to_places(self, begin, end):
@@ -878,7 +861,6 @@ class Elimination(System):
                     stage = FORWARD
                 elif hard == 2:
                     reported, bound, stage = TENSEST + zero, False, GIVE_WAY
-                    self.softened[b][3] = UNBORNE
                 else:
                     tension_at_start, total_at_start, bound, stage = tension, total, hard == 0, COMPARE
             elif stage == COMPARE:
@@ -891,7 +873,6 @@ class Elimination(System):
                     reported = ti.select(bound, tension_at_start, ti.min(tension, TENSEST))
                     reported = ti.select(longer > 1, ti.min(reported, TENSEST), reported)
                     stage = GIVE_WAY
-                    self.softened[b][3] = ti.select(bound, tension_at_start, tension) / longer
                     if longer * self.earlier_tension(begin, end) > YIELD:
                         for r in range(begin, end):
                             self.step[r] = 0

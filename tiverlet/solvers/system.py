@@ -39,7 +39,8 @@ class System:
     answers = False  # whether parts answer the impulses of contacts, see Elimination.answer_part()
     steps = 0  # iterations of a pass, by start(), iterate() and end(); 0 for a solution by solve()
     refines = False  # whether parts may take a second Newton step in a pass, see takes_step() and is_unmet()
-    can_stiffen: Any = False  # whether parts gave way in a longer substep, and may bear their loads in this one
+    softest: Any = 1.0  # (h' / h)^2 for the longest substep h' whose yield loads a part has, see Elimination
+    stored: Any = 0.0  # the energy of such parts, times h^2
     has_implied = False  # whether rows are links that others imply, which take no step
     late: tuple[str, ...] = ()  # the names of fields in the state that are not hashed where they are 0
     team: Any  # the threads that share the loops of start(), iterate() and end(); set when kernels are built
@@ -133,16 +134,8 @@ class System:
         """Return a mask of the constraints of a batch in parts that give way, (m,)."""
         return np.zeros(batch.count, dtype=bool)
 
-    def keep_softness(self, ratio: float) -> None:
-        """Keep parts that give way as soft as they are, where the next substep is `ratio` times as long as the last one."""
-
-    def softness_of_longer(self, h: float) -> tuple[float, float]:
-        """Return (h' / h)^2 for the longest substep h' whose yield loads a part has, and the energy that such parts store in
-        substeps h [J]."""
-        return 1.0, 0.0
-
     def stiffen(self, factor: float) -> None:
-        """Let parts with the yield loads of a longer substep bear tensions that are `factor` times as large."""
+        """Let parts that give way bear tensions that are `factor` times as large, (omega h)^2, up to those of this substep."""
 
     @ti.func
     def bound_row(self, r, low, high):

@@ -172,7 +172,7 @@ class Runner:
                 self._note_moved(settling.settle(self, first, h, dt))  # before what is violated passes for what passes have left
             if h != clock.h or drag != clock.drag:
                 if self.scene.slots and self.scene.slots.system and clock.h:
-                    self.scene.slots.system.keep_softness(h / clock.h)
+                    self.scene.slots.system.stiffen((h / clock.h) ** 2)
                 less = settling.relieve(self, h, dt) if self._relieves(h, dt, keeps, adapts) else 1.0
                 if less < 1:
                     self._forget_system()
@@ -201,8 +201,7 @@ class Runner:
         slots, clock = self.scene.slots, self.clock
         if not slots or h >= softness.NEAR * clock.longest or keeps or self.probe or clock.first_moved is not None:
             return False
-        steady = dt == clock.frame[1] and not (self.driven or self.ramping)
-        return adapts or steady or bool(slots.system and slots.system.can_stiffen)
+        return adapts or (dt == clock.frame[1] and not (self.driven or self.ramping))
 
     def _forget_system(self) -> None:
         """Let a system forget what it has learnt from earlier positions."""

@@ -63,7 +63,7 @@ def keep(runner: "Runner", h: float, dt: float, iterations: int, adapts: bool = 
     stored that is left, where violations have just settled. By so much links may stiffen at once.
     """
     clock, system = runner.clock, runner.scene.slots.system if runner.scene.slots else None
-    clock.part_softness, energy = system.softness_of_longer(h) if system else (1.0, 0.0)
+    clock.part_softness = system.softest if system else 1.0
     if acts(runner, h, iterations):
         soft = clock.softness * left / _growth(runner, h, iterations)
         clock.longest = clock.longest if NEAR * clock.longest <= h <= clock.longest else h
@@ -72,13 +72,12 @@ def keep(runner: "Runner", h: float, dt: float, iterations: int, adapts: bool = 
         if more > 1 and clock.softness == 1 and needs_no_care(runner, more * least):
             clock.longest, least, more = h, 1.0, 1.0
         if more > 1:
-            more /= stiffening(runner, more, _stored_before(runner, left) + energy, dt, adapts)
+            more /= stiffening(runner, more, _stored_before(runner, left), dt, adapts)
         runner.set_softness(least * more if more > 1 + SETTLED else least)
     else:
         clock.longest = h
     if system and clock.part_softness > 1:
-        store = _stored_before(runner, left) + energy
-        system.stiffen((1 + stiffening(runner, clock.part_softness, store, dt, adapts=True)) / 2)
+        system.stiffen((1 + stiffening(runner, clock.part_softness, _stored_before(runner, left), dt, adapts=True)) / 2)
 
 
 def stiffening(runner: "Runner", s: float, store: float, dt: float, adapts: bool) -> float:
@@ -95,8 +94,10 @@ def stiffening(runner: "Runner", s: float, store: float, dt: float, adapts: bool
 
 
 def _stored_before(runner: "Runner", left: float) -> float:
-    """Return what relaxed links stored before they settled [J], as they do with the softness that keep() gives them."""
-    return stored(runner) / left if left > 0 else 0.0
+    """Return what relaxed links stored before they settled [J], as they do with the softness that keep() gives them, and what
+    parts of systems store that gave way in a longer substep."""
+    system, out = runner.scene.slots.system, stored(runner) / left if left > 0 else 0.0
+    return out + system.stored / runner.clock.h**2 if system else out
 
 
 def _room(runner: "Runner") -> float | None:
