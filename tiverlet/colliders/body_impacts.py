@@ -88,14 +88,14 @@ class BodyImpacts:
         self.struck = add("impacts.struck", n, kind=ti.i32)  # STRUCK_NOW, STRUCK_BEFORE, or 0
         self.normal, self.moved = add("impacts.normal", n, width=dim), add("impacts.wall_moved", n, width=dim)
         self.coefficients = add("impacts.friction", n, width=2)
-        self.target, self.pushed, self.first_push = (add(f"impacts.{k}", n) for k in ("target", "pushed", "first_push"))
-        self.held, self.sticks = add("impacts.held", n, width=dim), add("impacts.sticks", n, kind=ti.i32)  # by friction
-        # Of the last substep: what friction took, the push, and whether the particle STUCK or SLID; 0 where none struck it.
-        self.braked, self.pushed_before = (
-            add("impacts.braked", n, width=dim, state=True),
-            add("impacts.pushed_before", n, state=True),
-        )
+        self.target, self.first_push = (add(f"impacts.{k}", n) for k in ("target", "first_push"))
+        self.pushed = add("impacts.pushed", n, state=True)
+        # By friction, and whether that holds it; whether it STUCK or SLID in this substep, 0 where no wall struck it.
+        self.held, self.sticks = add("impacts.held", n, width=dim, state=True), add("impacts.sticks", n, kind=ti.i32)
         self.slides = add("impacts.slides", n, kind=ti.i32, state=True)
+        # The same of the last substep.
+        self.braked, self.pushed_before = add("impacts.braked", n, width=dim), add("impacts.pushed_before", n)
+        self.slid = add("impacts.slid", n, kind=ti.i32)
         self.bends = any(b.clusters for b in batches)
         if self.bends:
             self.bend = add("impacts.bend", n)  # of the path of a particle of a cluster along the normal, see ClusterImpact [m]
@@ -143,28 +143,25 @@ class BodyImpacts:
 
     @ti.func
     def clear(self, i):
-        """At the start of a substep: clear the marks of particle i."""
-        self.struck[i] = self.reached[i] = 0
+        """At the start of a substep: clear the marks of particle i, but for how the last one pushed it."""
+        self.slid[i], self.braked[i], self.pushed_before[i] = self.slides[i], self.held[i], self.pushed[i]
+        self.struck[i] = self.reached[i] = self.slides[i] = 0
+        self.held[i], self.pushed[i] = ti.zero(self.held[i]), 0
 
     @ti.func
-    def note_slip(self, i):
-        """At the end of a substep: note if particle i slides: with all of its friction, and other than by what passes lack."""
-        slides, struck = False, self.struck[i] != 0
-        self.braked[i], self.pushed_before[i] = ti.zero(self.held[i]), ti.zero(self.pushed[i])
-        if struck and self.pushed[i] > 0:
-            d = self.state.d[i] - self.moved[i]
-            slip = (d - d.dot(self.normal[i]) * self.normal[i]).norm()
-            bound = self.friction_bound(i, self.held[i])
-            full = self.held[i].norm() >= ti.static(1 - FULL) * bound * self.pushed[i]
-            brakes = self.slides[i] == SLID and bound < self.coefficients[i][0]
-            slides = full and (brakes or slip > ti.static(SLIPS) * self.first_push[i])
-            self.braked[i], self.pushed_before[i] = self.held[i], self.pushed[i]
-        self.slides[i] = ti.select(struck, ti.select(slides, SLID, STUCK), 0)
+    def note_slip(self, i, d):
+        """Note whether particle i, which moves by d, slides: with all of its friction, and other than by what passes lack."""
+        across = d - self.moved[i] - (d - self.moved[i]).dot(self.normal[i]) * self.normal[i]
+        bound = self.friction_bound(i, self.held[i])
+        full = self.pushed[i] > 0 and self.held[i].norm() >= ti.static(1 - FULL) * bound * self.pushed[i]
+        brakes = self.slid[i] == SLID and bound < self.coefficients[i][0]
+        slides = full and (brakes or across.norm() > ti.static(SLIPS) * self.first_push[i])
+        self.slides[i] = ti.select(slides, SLID, STUCK)
 
     @ti.func
     def friction_bound(self, i, held):
         """Return the coefficient of friction of particle i where friction takes `held` of its displacement."""
-        brakes = self.slides[i] == SLID and not held.dot(self.braked[i]) < 0  # else it brakes no more, but holds
+        brakes = self.slid[i] == SLID and not held.dot(self.braked[i]) < 0  # else it brakes no more, but holds
         return ti.select(brakes, self.coefficients[i][1], self.coefficients[i][0])
 
     @ti.func
@@ -262,9 +259,9 @@ class BodyImpacts:
             self.pushed[i], self.first_push[i] = 0 * target, target - leaving
             self.coefficients[i] = [static, dynamic]
             self.held[i], self.sticks[i] = ti.zero(n), 0
-            if self.slides[i] == 0:
+            if self.slid[i] == 0:
                 d = self.state.d[i] - moved
-                self.slides[i] = ti.select((d - d.dot(n) * n).norm() > ti.static(FAST) * (target - leaving), SLID, STUCK)
+                self.slid[i] = ti.select((d - d.dot(n) * n).norm() > ti.static(FAST) * (target - leaving), SLID, STUCK)
             if ti.static(self.bends):
                 self.bend[i] = 0 * target
             self.log[i] = log
@@ -328,6 +325,7 @@ class BodyImpacts:
             change -= held - self.held[i]
             self.held[i] = held
             self.state.shift(i, change)
+            self.note_slip(i, self.state.d[i])
             self.reached[i] = 1
         return off
 

@@ -130,7 +130,7 @@ class Step:
         self.newton_steps = 2 if scene.slots and scene.slots.refines else 1  # most of them in a pass
         self.orients = self.state.spins and self.state.spin.orients
         keeps = self.contact_pass.remembers or bool(self.breakers)
-        self.finishes = keeps or self.orients or bool(self.wall_logs) or self.has_impacts
+        self.finishes = keeps or self.orients or bool(self.wall_logs)
         self.hashes = bool(search)
         self.sleepers = scene.state.sleepers
         self.looks = bool(search) and bool(self.sleepers)  # for contacts between awake and sleeping particles
@@ -494,9 +494,6 @@ class Step:
             for i in range(self.team.chunk_begin(self.n, now.thread), self.team.chunk_end(self.n, now.thread)):
                 if self.state.awake(i):
                     self.state.spin.update_orientation(i)
-        if ti.static(self.has_impacts):
-            for i in range(self.team.chunk_begin(self.n, now.thread), self.team.chunk_end(self.n, now.thread)):
-                self.impacts.note_slip(i)
         for log in ti.static(self.wall_logs):
             n = self.n * now.final
             for i in range(self.team.chunk_begin(n, now.thread), self.team.chunk_end(n, now.thread)):

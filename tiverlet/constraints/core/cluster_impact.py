@@ -94,6 +94,7 @@ class ClusterImpact:
             if self.impacts.struck[i] != 0:
                 s = self.cluster.relative_position(e, i0, 1) - start
                 self.impacts.bend[i] = ti.cast(rotation.bend(turn + W, s, ti.cast(self.impacts.normal[i], ti.f64)), self.real)
+                self.impacts.note_slip(i, self.state.d[i] + move)
             self.impacts.mark_struck_in_cluster(i)
             self.corners.write_move(e, move)
         rotation.write_rows(self.cluster.pose, c, T @ rotation.from_rows(self.cluster.pose[c]))
