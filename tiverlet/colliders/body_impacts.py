@@ -72,10 +72,10 @@ class BodyImpacts:
     A rigid cluster that shares none of its particles moves as a rigid body in these passes, about those that cannot move, see
     ClusterImpact. Where there are contacts, walls are rows, and nothing of this is needed.
 
-    open: for each pass beyond the regular ones of every substep, whether it is needed.
+    rubs: whether a wall has friction. open: for each pass beyond the regular ones of every substep, whether it is needed.
     """
 
-    def __init__(self, scene: "Scene", batches: "list[Batch]"):
+    def __init__(self, scene: "Scene", batches: "list[Batch]", rubs: bool):
         system, batches = scene.slots.system, holding_bodies(batches)
         self.passes = FEW if system or all(b.clusters for b in batches) else MANY
         self.spreads = not system  # from link to link; a system solves all links at once
@@ -89,13 +89,15 @@ class BodyImpacts:
         self.normal, self.moved = add("impacts.normal", n, width=dim), add("impacts.wall_moved", n, width=dim)
         self.coefficients = add("impacts.friction", n, width=2)
         self.target, self.first_push = (add(f"impacts.{k}", n) for k in ("target", "first_push"))
-        self.pushed = add("impacts.pushed", n, state=True)
-        # By friction, and whether that holds it; whether it STUCK or SLID in this substep, 0 where no wall struck it.
-        self.held, self.sticks = add("impacts.held", n, width=dim, state=True), add("impacts.sticks", n, kind=ti.i32)
-        self.slides = add("impacts.slides", n, kind=ti.i32, state=True)
-        # The same of the last substep.
-        self.braked, self.pushed_before = add("impacts.braked", n, width=dim), add("impacts.pushed_before", n)
-        self.slid = add("impacts.slid", n, kind=ti.i32)
+        self.pushed = add("impacts.pushed", n, state=rubs)
+        self.rubs = rubs
+        self.held = add("impacts.held", n, width=dim, state=rubs)  # by friction
+        if rubs:
+            # Whether friction holds it; whether it STUCK or SLID in this substep, 0 where no wall struck it.
+            self.sticks, self.slides = add("impacts.sticks", n, kind=ti.i32), add("impacts.slides", n, kind=ti.i32, state=True)
+            # The same of the last substep.
+            self.braked, self.pushed_before = add("impacts.braked", n, width=dim), add("impacts.pushed_before", n)
+            self.slid = add("impacts.slid", n, kind=ti.i32)
         self.bends = any(b.clusters for b in batches)
         if self.bends:
             self.bend = add("impacts.bend", n)  # of the path of a particle of a cluster along the normal, see ClusterImpact [m]
@@ -144,13 +146,19 @@ class BodyImpacts:
     @ti.func
     def clear(self, i):
         """At the start of a substep: clear the marks of particle i, but for how the last one pushed it."""
-        self.slid[i], self.braked[i], self.pushed_before[i] = self.slides[i], self.held[i], self.pushed[i]
-        self.struck[i] = self.reached[i] = self.slides[i] = 0
-        self.held[i], self.pushed[i] = ti.zero(self.held[i]), 0
+        self.struck[i] = self.reached[i] = 0
+        if ti.static(self.rubs):
+            self.slid[i], self.braked[i], self.pushed_before[i] = self.slides[i], self.held[i], self.pushed[i]
+            self.slides[i], self.held[i], self.pushed[i] = 0, ti.zero(self.held[i]), 0
 
     @ti.func
     def note_slip(self, i, d):
         """Note whether particle i, which moves by d, slides: with all of its friction, and other than by what passes lack."""
+        if ti.static(self.rubs):
+            self._note_slip(i, d)
+
+    @ti.func
+    def _note_slip(self, i, d):
         across = d - self.moved[i] - (d - self.moved[i]).dot(self.normal[i]) * self.normal[i]
         bound = self.friction_bound(i, self.held[i])
         full = self.pushed[i] > 0 and self.held[i].norm() >= ti.static(1 - FULL) * bound * self.pushed[i]
@@ -161,8 +169,11 @@ class BodyImpacts:
     @ti.func
     def friction_bound(self, i, held):
         """Return the coefficient of friction of particle i where friction takes `held` of its displacement."""
-        brakes = self.slid[i] == SLID and not held.dot(self.braked[i]) < 0  # else it brakes no more, but holds
-        return ti.select(brakes, self.coefficients[i][1], self.coefficients[i][0])
+        out = self.coefficients[i][0]
+        if ti.static(self.rubs):
+            if self.slid[i] == SLID and not held.dot(self.braked[i]) < 0:  # else it brakes no more, but holds
+                out = self.coefficients[i][1]
+        return out
 
     @ti.func
     def near_enough(self, i):
@@ -227,7 +238,10 @@ class BodyImpacts:
     @ti.func
     def held_part(self, i, g):
         """Return the part of the gradient g, of particle i, along which a wall holds the particle: all of it where it sticks."""
-        part = ti.select(self.sticks[i] != 0, g, g.dot(self.normal[i]) * self.normal[i])
+        part = g.dot(self.normal[i]) * self.normal[i]
+        if ti.static(self.rubs):
+            if self.sticks[i] != 0:
+                part = g
         return ti.select(self.is_held(i), part, 0 * g)
 
     @ti.func
@@ -258,10 +272,12 @@ class BodyImpacts:
             self.normal[i], self.moved[i], self.target[i] = n, moved, target
             self.pushed[i], self.first_push[i] = 0 * target, target - leaving
             self.coefficients[i] = [static, dynamic]
-            self.held[i], self.sticks[i] = ti.zero(n), 0
-            if self.slid[i] == 0:
-                d = self.state.d[i] - moved
-                self.slid[i] = ti.select((d - d.dot(n) * n).norm() > ti.static(FAST) * (target - leaving), SLID, STUCK)
+            self.held[i] = ti.zero(n)
+            if ti.static(self.rubs):
+                self.sticks[i] = 0
+                if self.slid[i] == 0:
+                    d = self.state.d[i] - moved
+                    self.slid[i] = ti.select((d - d.dot(n) * n).norm() > ti.static(FAST) * (target - leaving), SLID, STUCK)
             if ti.static(self.bends):
                 self.bend[i] = 0 * target
             self.log[i] = log
@@ -311,19 +327,17 @@ class BodyImpacts:
             if ti.static(not self.exact) or self.target[i] > 0:
                 off = off or ti.abs(miss) > self.near_enough(i)
             self.log_push(i, change)
-            held = self.held[i] + d - d.dot(n) * n
-            size = held.norm()
-            support = ti.max(pushed, 0)
-            bound = self.friction_bound(i, held) * support
-            sticks = size <= bound and bound > 0
-            if not sticks and size > 0:
-                held *= bound / size
-            if self.coefficients[i][0] > 0:
-                off = off or sticks != (self.sticks[i] != 0)
-                off = off or (not sticks and (held - self.held[i]).norm() > self.near_enough(i))
-            self.sticks[i] = ti.cast(sticks, ti.i32)
-            change -= held - self.held[i]
-            self.held[i] = held
+            if ti.static(self.rubs):
+                held = self.held[i] + d - d.dot(n) * n
+                size, bound = held.norm(), self.friction_bound(i, held) * ti.max(pushed, 0)
+                sticks = size <= bound and bound > 0
+                if not sticks and size > 0:
+                    held *= bound / size
+                if self.coefficients[i][0] > 0:
+                    off = off or sticks != (self.sticks[i] != 0)
+                    off = off or (not sticks and (held - self.held[i]).norm() > self.near_enough(i))
+                change -= held - self.held[i]
+                self.sticks[i], self.held[i] = ti.cast(sticks, ti.i32), held
             self.state.shift(i, change)
             self.note_slip(i, self.state.d[i])
             self.reached[i] = 1

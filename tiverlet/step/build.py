@@ -179,7 +179,7 @@ def _bind(scene: Scene, features: tuple[Feature, ...], solver: Solver | None, pa
         contact.enter(scene)
     if can_have_impacts(scene, batches) and not rows:
         if any(w.has_restitution for w in walls) or (walls and stops_bodies(scene, batches)):
-            scene.impacts = BodyImpacts(scene, batches)
+            scene.impacts = BodyImpacts(scene, batches, any(w.has_friction for w in walls))
     search = contact.make_search(scene, batches, team) if contact else None
     state.remember(
         memory,

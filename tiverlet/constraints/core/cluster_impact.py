@@ -65,15 +65,16 @@ class ClusterImpact:
         self.aim_along_tangents(begin, end, i0, start, turn)
         for k in ti.static(range(self.state.dim)):
             S[k, k] += M * far * far
-        for e in range(begin, end):  # begin with the pushes of the last substep
-            i = self.corners.members[e]
-            if self.impacts.is_struck_now(i):
-                s = self.cluster.relative_position(e, i0, 1) - start
-                self.impacts.pushed[i], self.impacts.held[i] = self.impacts.pushed_before[i], self.impacts.braked[i]
-                change = ti.cast(self.impacts.pushed[i] * self.impacts.normal[i] - self.impacts.held[i], ti.f64)
-                push = self.cluster.mass_of(e, c, FIXED) * change
-                V += push / M
-                W += rotation.turn_rate(S, rotation.axial(push.outer_product(s)))
+        if ti.static(self.impacts.rubs):
+            for e in range(begin, end):  # begin with the pushes of the last substep
+                i = self.corners.members[e]
+                if self.impacts.is_struck_now(i):
+                    s = self.cluster.relative_position(e, i0, 1) - start
+                    self.impacts.pushed[i], self.impacts.held[i] = self.impacts.pushed_before[i], self.impacts.braked[i]
+                    change = ti.cast(self.impacts.pushed[i] * self.impacts.normal[i] - self.impacts.held[i], ti.f64)
+                    push = self.cluster.mass_of(e, c, FIXED) * change
+                    V += push / M
+                    W += rotation.turn_rate(S, rotation.axial(push.outer_product(s)))
         for _ in range(SWEEPS):
             if off:
                 off = False
