@@ -887,7 +887,7 @@ class Elimination(System):
             if stage == GIVE_WAY:
                 self.end_newton(b)
                 stiffest = self.largest_diagonal(begin, end)
-                softness = ti.max(LEAST_SOFTNESS, 2 * self.epsilon) * stiffest
+                softness = ti.max(LEAST_SOFTNESS, self.epsilon) * stiffest
                 self.solve_active_set(begin, end, softness, 1, False)  # where pivots vanish, the signs found so far are rounding
                 self.let_yield(begin, end, longer)
         if ti.static(bool(self.joined)):
