@@ -2,7 +2,9 @@
 
 from typing import TYPE_CHECKING, Any
 
+from ..contact.limits import FULL, SLIPS, SLOW
 from ..device import ti
+from ..features.material import limit_length
 
 if TYPE_CHECKING:
     from ..features.feature import Batch, Scene
@@ -11,9 +13,7 @@ if TYPE_CHECKING:
 # impulses propagate from link to link. One or two do where a system solves them exactly, and most of MANY have little to do.
 FEW, MANY = 8, 32
 MET = 2.0**-9  # of the first push: a smaller error of the normal displacement counts as met
-ALONG = 0.99  # cosine between normals up to which what is left of a wall's depth is that of the same wall: 8 degrees
-FULL = 1e-3  # of its bound: friction that is so near to it is all that there is
-SLIPS, FAST = 1 / 64, 2.0  # of a push: less slip is what passes lack; what comes to touch with more slides at once
+SAME = 0.99  # cosine between normals up to which what is left of a wall's depth is that of the same wall: 8 degrees
 RESTS = False  # whether walls also hold bodies that rest in these passes, not only those that strike
 FELT = 2.0**-20  # of a squared displacement: a smaller change is no impact
 # What holds a particle that can move: rigid clusters that share particles, links, or a rigid cluster that shares none.
@@ -57,13 +57,13 @@ class BodyImpacts:
 
     Constraints take into account that the wall will do that: while p > 0, they have their gradients at the particle, and so its
     part in the matrix, without the direction of the normal, and without any where it sticks. So one pass suffices where they are
-    solved exactly, for any body and
-    any number of struck particles; there is another one if a particle was struck by it or came free, and for e > 0, until what is
-    left of second order is small. A wall that would have to pull, p < 0, does so until the next pass, in which constraints take
-    into account that it lets go; at once, it would throw its particle as far as it has to hold it. What the last pass leaves is
-    lost. All impacts of a substep together are Newton's law for a rigid body. At e = 1 energy is conserved to O(h) in an impact,
-    since a body turns in a substep, and to O(h^2) if it is a cluster. Friction holds the tangential displacement by up to its
-    coefficient times p: the static one where the particle stuck before, the dynamic one where it slid, until that would push it.
+    solved exactly, for any body and any number of struck particles; there is another one if a particle was struck by it, came
+    free, or sticks no more, and until what is left of friction, and for e > 0 of second order, is small. A wall that would have
+    to pull, p < 0, does so until the next pass, in which constraints take into account that it lets go; at once, it would throw
+    its particle as far as it has to hold it. What the last pass leaves is lost. All impacts of a substep together are Newton's
+    law for a rigid body. At e = 1 energy is conserved to O(h) in an impact, since a body turns in a substep, and to O(h^2) if it
+    is a cluster. Friction holds the tangential displacement by up to its coefficient times p: the static one where the particle
+    stuck before, the dynamic one where it slid, until that would push it.
 
     These passes leave the violations that the regular passes left, and those of springs: removed all at once, they would become
     speed. Contacts, outlines, places, and clusters that share particles wait for the next substep. A particle that approaches by
@@ -81,7 +81,7 @@ class BodyImpacts:
         self.spreads = not system  # from link to link; a system solves all links at once
         self.exact = is_exact(scene, [b for b in batches if not b.clusters])
         self.leaves = not self.exact  # regular passes leave violations
-        self.stops, self.rests = stops_bodies(scene, batches), RESTS
+        self.stops, self.rests, self.rubs = stops_bodies(scene, batches), RESTS, rubs
         n, dim, add = scene.count, scene.particles.dim, scene.memory.field
         self.state = scene.state
         self.rigid = add("impacts.rigid", n, kind=ti.i32)  # IN_SHARED, LINKED, IN_CLUSTER, or 0
@@ -90,7 +90,6 @@ class BodyImpacts:
         self.coefficients = add("impacts.friction", n, width=2)
         self.target, self.first_push = (add(f"impacts.{k}", n) for k in ("target", "first_push"))
         self.pushed = add("impacts.pushed", n, state=rubs)
-        self.rubs = rubs
         self.held = add("impacts.held", n, width=dim, state=rubs)  # by friction
         if rubs:
             # Whether friction holds it; whether it STUCK or SLID in this substep, 0 where no wall struck it.
@@ -155,25 +154,18 @@ class BodyImpacts:
     def note_slip(self, i, d):
         """Note whether particle i, which moves by d, slides: with all of its friction, and other than by what passes lack."""
         if ti.static(self.rubs):
-            self._note_slip(i, d)
-
-    @ti.func
-    def _note_slip(self, i, d):
-        across = d - self.moved[i] - (d - self.moved[i]).dot(self.normal[i]) * self.normal[i]
-        bound = self.friction_bound(i, self.held[i])
-        full = self.pushed[i] > 0 and self.held[i].norm() >= ti.static(1 - FULL) * bound * self.pushed[i]
-        brakes = self.slid[i] == SLID and bound < self.coefficients[i][0]
-        slides = full and (brakes or across.norm() > ti.static(SLIPS) * self.first_push[i])
-        self.slides[i] = ti.select(slides, SLID, STUCK)
+            across = d - self.moved[i] - (d - self.moved[i]).dot(self.normal[i]) * self.normal[i]
+            bound = self.friction_bound(i, self.held[i])
+            full = self.pushed[i] > 0 and self.held[i].norm() >= ti.static(1 - FULL) * bound * self.pushed[i]
+            brakes = self.slid[i] == SLID and bound < self.coefficients[i][0]
+            slides = full and (brakes or across.norm() > ti.static(SLIPS) * self.first_push[i])
+            self.slides[i] = ti.select(slides, SLID, STUCK)
 
     @ti.func
     def friction_bound(self, i, held):
         """Return the coefficient of friction of particle i where friction takes `held` of its displacement."""
-        out = self.coefficients[i][0]
-        if ti.static(self.rubs):
-            if self.slid[i] == SLID and not held.dot(self.braked[i]) < 0:  # else it brakes no more, but holds
-                out = self.coefficients[i][1]
-        return out
+        brakes = self.slid[i] == SLID and not held.dot(self.braked[i]) < 0  # else it brakes no more, but holds
+        return ti.select(brakes, self.coefficients[i][1], self.coefficients[i][0])
 
     @ti.func
     def near_enough(self, i):
@@ -277,7 +269,7 @@ class BodyImpacts:
                 self.sticks[i] = 0
                 if self.slid[i] == 0:
                     d = self.state.d[i] - moved
-                    self.slid[i] = ti.select((d - d.dot(n) * n).norm() > ti.static(FAST) * (target - leaving), SLID, STUCK)
+                    self.slid[i] = ti.select((d - d.dot(n) * n).norm() > ti.static(SLOW) * (target - leaving), SLID, STUCK)
             if ti.static(self.bends):
                 self.bend[i] = 0 * target
             self.log[i] = log
@@ -286,7 +278,7 @@ class BodyImpacts:
     @ti.func
     def answers(self, i, n):
         """Whether particle i has its impulse from a wall with the normal n in this substep."""
-        return self.struck[i] == STRUCK_BEFORE and n.dot(self.normal[i]) > ti.static(ALONG)
+        return self.struck[i] == STRUCK_BEFORE and n.dot(self.normal[i]) > ti.static(SAME)
 
     @ti.func
     def cancel_bounce(self, i, n):
@@ -329,10 +321,9 @@ class BodyImpacts:
             self.log_push(i, change)
             if ti.static(self.rubs):
                 held = self.held[i] + d - d.dot(n) * n
-                size, bound = held.norm(), self.friction_bound(i, held) * ti.max(pushed, 0)
-                sticks = size <= bound and bound > 0
-                if not sticks and size > 0:
-                    held *= bound / size
+                bound = self.friction_bound(i, held) * ti.max(pushed, 0)
+                sticks = held.norm() <= bound and bound > 0
+                held = limit_length(held, bound, bound)
                 if self.coefficients[i][0] > 0:
                     off = off or sticks != (self.sticks[i] != 0)
                     off = off or (not sticks and (held - self.held[i]).norm() > self.near_enough(i))

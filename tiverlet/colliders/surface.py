@@ -278,11 +278,8 @@ class Surface:
                 if self.restitution[None] > 0:
                     bounces, target = True, -self.restitution[None] * before
             fast = -before > ti.static(SLOW) * ti.abs(before - leaving)
-            if ti.static(self.impacts.rests):
-                if not fast:
-                    bounces, target = ti.static(self.impacts.stops), after
-            else:
-                bounces = bounces and fast
+            if not fast:
+                bounces, target = ti.static(self.impacts.rests and self.impacts.stops), after
             static = dynamic = 0 * target
             if ti.static(self.has_friction):
                 static, dynamic = self.static(), self.dynamic()

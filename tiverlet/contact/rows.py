@@ -18,7 +18,7 @@ from ..features.material import DYNAMIC, RESTITUTION, ROLLING, STATIC, TANGENTIA
 from ..neighbours.neighbour_list import WALL
 from ..neighbours.pair_data import Column, PairData
 from .impacts import Impacts
-from .limits import AHEAD, BEYOND, FEW, FOREIGN, OWN, SLOP, SLOW, TOGETHER
+from .limits import AHEAD, BEYOND, FEW, FOREIGN, FULL, OWN, SLIPS, SLOP, SLOW, TOGETHER
 from .meeting import meeting
 
 if TYPE_CHECKING:
@@ -29,8 +29,6 @@ if TYPE_CHECKING:
 
 NOISE = 64.0  # times the rounding of a displacement: what comes together no faster is at rest
 STEADY = 1 / 16  # of an impulse: it may change by so much in a substep, beside what forces change, and be a load
-FULL = 2.0**-10  # of the bound of friction: an impulse nearer to it than this is at the bound
-SLIPS = 1 / 64  # of the displacement by forces: less slip than this in a substep is what passes lack
 QUARTER = 0.25  # of the smaller radius: by how much a pair that overlaps parts in a substep at most
 
 # In which turn a particle lists a pair, by where the other one is: in a piece before, behind it in the same piece, in a piece

@@ -3,6 +3,7 @@
 from typing import Any
 
 from ...device import ti
+from ...features.material import limit_length
 from ...geometry import rotation
 
 SWEEPS = 64  # over the particles that were struck, at most
@@ -130,17 +131,16 @@ class ClusterImpact:
         miss = ti.cast(self.impacts.target[i], ti.f64) + rotation.bend(turn + W, s, n) - d.dot(n)
         self.impacts.pushed[i] = ti.max(p + ti.cast(miss / (m * self.give(s, n, M, S)), self.real), 0)
         push = ti.cast(self.impacts.pushed[i] - p, ti.f64) * n
-        across = d - d.dot(n) * n
-        slip = across.norm()
-        if self.impacts.coefficients[i][0] > 0 and slip > 0:
-            last = ti.cast(self.impacts.held[i], ti.f64)
-            held = last + across / (m * self.give(s, across / slip, M, S))
-            bound = self.impacts.friction_bound(i, ti.cast(held, self.real)) * self.impacts.pushed[i]
-            size, most = held.norm(), ti.cast(bound, ti.f64)
-            if size > most:
-                held *= most / size
-            self.impacts.held[i] = ti.cast(held, self.real)
-            push -= held - last
+        if ti.static(self.impacts.rubs):
+            across = d - d.dot(n) * n
+            slip = across.norm()
+            if self.impacts.coefficients[i][0] > 0 and slip > 0:
+                last = ti.cast(self.impacts.held[i], ti.f64)
+                held = last + across / (m * self.give(s, across / slip, M, S))
+                most = self.impacts.friction_bound(i, ti.cast(held, self.real)) * self.impacts.pushed[i]
+                held = limit_length(held, ti.cast(most, ti.f64), ti.cast(most, ti.f64))
+                self.impacts.held[i] = ti.cast(held, self.real)
+                push -= held - last
         return m * push, ti.abs(self.impacts.pushed[i] - p)
 
     @ti.func
