@@ -14,7 +14,6 @@ if TYPE_CHECKING:
 FEW, MANY = 8, 32
 MET = 2.0**-9  # of the first push: a smaller error of the normal displacement counts as met
 SAME = 0.99  # cosine between normals up to which what is left of a wall's depth is that of the same wall: 8 degrees
-RESTS = False  # whether walls also hold bodies that rest in these passes, not only those that strike
 FELT = 2.0**-20  # of a squared displacement: a smaller change is no impact
 # What holds a particle that can move: rigid clusters that share particles, links, or a rigid cluster that shares none.
 IN_SHARED, LINKED, IN_CLUSTER = 1, 2, 3
@@ -81,7 +80,7 @@ class BodyImpacts:
         self.spreads = not system  # from link to link; a system solves all links at once
         self.exact = is_exact(scene, [b for b in batches if not b.clusters])
         self.leaves = not self.exact  # regular passes leave violations
-        self.stops, self.rests, self.rubs = stops_bodies(scene, batches), RESTS, rubs
+        self.stops, self.rubs = stops_bodies(scene, batches), rubs
         n, dim, add = scene.count, scene.particles.dim, scene.memory.field
         self.state = scene.state
         self.rigid = add("impacts.rigid", n, kind=ti.i32)  # IN_SHARED, LINKED, IN_CLUSTER, or 0

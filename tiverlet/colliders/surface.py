@@ -190,9 +190,9 @@ class Surface:
                     gap = 0 * gap
                 strikes = gap >= 0 and leaving < 0 and mode != FRICTIONLESS
                 if self.is_linked(i):
-                    if strikes or self.takes_rest(mode):
+                    if strikes:
                         end = leaving + move
-                        if self.defer_impact(i, n, moved, leaving, ti.select(strikes, before, 0 * before), ti.min(end, 0)):
+                        if self.defer_impact(i, n, moved, leaving, before, ti.min(end, 0)):
                             move, after = ti.max(end, 0), leaving  # what was inside before comes out without momentum
                         elif self.is_answered(i, n):
                             after = leaving
@@ -251,11 +251,6 @@ class Surface:
             out = self.impacts.is_struck_now(i)
         return out
 
-    @inline
-    def takes_rest(self, mode):
-        """Whether linked particles that rest on the wall take part in impacts of bodies."""
-        return (mode != FRICTIONLESS) & (self.has_impacts and self.impacts.rests)
-
     @ti.func
     def is_answered(self, i, n):
         """Whether linked particle i has its impulse from a wall with the normal n: what is left moves it without momentum."""
@@ -277,9 +272,7 @@ class Surface:
             if ti.static(self.has_restitution):
                 if self.restitution[None] > 0:
                     bounces, target = True, -self.restitution[None] * before
-            fast = -before > ti.static(SLOW) * ti.abs(before - leaving)
-            if not fast:
-                bounces, target = ti.static(self.impacts.rests and self.impacts.stops), after
+            bounces = bounces and -before > ti.static(SLOW) * ti.abs(before - leaving)
             static = dynamic = 0 * target
             if ti.static(self.has_friction):
                 static, dynamic = self.static(), self.dynamic()

@@ -116,6 +116,20 @@ def turn_rate(S, moment):
 
 
 @ti.func
+def inverse_inertia(S):
+    """Return the matrix I^-1 of a body with S = sum m r r^T: 1 x 1 in 2D."""
+    axes = ti.static(1 if S.n == 2 else 3)
+    out = ti.Matrix.zero(ti.f64, axes, axes)
+    for k in ti.static(range(axes)):
+        L = ti.Vector.zero(ti.f64, axes)
+        L[k] = 1
+        column = turn_rate(S, L)
+        for j in ti.static(range(axes)):
+            out[j, k] = column[j]
+    return out
+
+
+@ti.func
 def skew(x, like):
     """Return the matrix B with B r = x x r: one number x in 2D, three in 3D."""
     out = 0 * like

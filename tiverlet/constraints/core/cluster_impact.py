@@ -66,6 +66,7 @@ class ClusterImpact:
         self.aim_along_tangents(begin, end, i0, start, turn)
         for k in ti.static(range(self.state.dim)):
             S[k, k] += M * far * far
+        J = rotation.inverse_inertia(S)
         if ti.static(self.impacts.rubs):
             for e in range(begin, end):  # begin with the pushes of the last substep
                 i = self.corners.members[e]
@@ -75,7 +76,7 @@ class ClusterImpact:
                     change = ti.cast(self.impacts.pushed[i] * self.impacts.normal[i] - self.impacts.held[i], ti.f64)
                     push = self.cluster.mass_of(e, c, FIXED) * change
                     V += push / M
-                    W += rotation.turn_rate(S, rotation.axial(push.outer_product(s)))
+                    W += J @ rotation.axial(push.outer_product(s))
         for _ in range(SWEEPS):
             if off:
                 off = False
@@ -83,9 +84,9 @@ class ClusterImpact:
                     i = self.corners.members[e]
                     if self.impacts.struck[i] != 0:
                         r, s = self.cluster.relative_position(e, i0, 0) - center, self.cluster.relative_position(e, i0, 1) - start
-                        push, change = self.corrected_push(i, r, s, V, W, turn, M, S, self.cluster.mass_of(e, c, FIXED))
+                        push, change = self.corrected_push(i, r, s, V, W, turn, M, J, self.cluster.mass_of(e, c, FIXED))
                         V += push / M
-                        W += rotation.turn_rate(S, rotation.axial(push.outer_product(s)))
+                        W += J @ rotation.axial(push.outer_product(s))
                         off = off or change > ti.static(MET) * self.impacts.first_push[i]
         T = rotation.cayley(W, S)
         for e in range(begin, end):
@@ -124,19 +125,19 @@ class ClusterImpact:
                     self.impacts.target[i] = ti.cast(target * ti.max(1 + b / before, 0), self.real)
 
     @ti.func
-    def corrected_push(self, i, r, s, V, W, turn, M, S, m):
+    def corrected_push(self, i, r, s, V, W, turn, M, J, m):
         """Correct the push of particle i. Returns the change of its impulse, times the substep, and how much the push changed."""
         n, p = ti.cast(self.impacts.normal[i], ti.f64), self.impacts.pushed[i]
         d = ti.cast(self.state.d[i] - self.impacts.moved[i], ti.f64) + V + rotation.moved_by(W, r)
         miss = ti.cast(self.impacts.target[i], ti.f64) + rotation.bend(turn + W, s, n) - d.dot(n)
-        self.impacts.pushed[i] = ti.max(p + ti.cast(miss / (m * self.give(s, n, M, S)), self.real), 0)
+        self.impacts.pushed[i] = ti.max(p + ti.cast(miss / (m * self.give(s, n, M, J)), self.real), 0)
         push = ti.cast(self.impacts.pushed[i] - p, ti.f64) * n
         if ti.static(self.impacts.rubs):
             across = d - d.dot(n) * n
             slip = across.norm()
             if self.impacts.coefficients[i][0] > 0 and slip > 0:
                 last = ti.cast(self.impacts.held[i], ti.f64)
-                held = last + across / (m * self.give(s, across / slip, M, S))
+                held = last + across / (m * self.give(s, across / slip, M, J))
                 most = self.impacts.friction_bound(i, ti.cast(held, self.real)) * self.impacts.pushed[i]
                 held = limit_length(held, ti.cast(most, ti.f64), ti.cast(most, ti.f64))
                 self.impacts.held[i] = ti.cast(held, self.real)
@@ -144,10 +145,10 @@ class ClusterImpact:
         return m * push, ti.abs(self.impacts.pushed[i] - p)
 
     @ti.func
-    def give(self, r, n, M, S):
-        """Return the displacement along n, at r from the center, for an impulse times the substep of 1 there: k / m."""
+    def give(self, r, n, M, J):
+        """Return the displacement along n, at r from the center, for an impulse times the substep of 1 there: k / m. J: I^-1."""
         arm = rotation.axial(n.outer_product(r))
-        return 1 / M + arm.dot(rotation.turn_rate(S, arm))
+        return 1 / M + arm.dot(J @ arm)
 
     @ti.func
     def count_push(self, e, sign):
