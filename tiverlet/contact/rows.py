@@ -328,22 +328,28 @@ class Rows:
 
     @ti.func
     def find_pairs(self, i, begin, end, row, scale):
-        """List the rows of pairs of particle i. Returns the row behind the last."""
+        """List the rows of pairs of particle i. Returns the row behind the last.
+
+        Its entries are sorted by the other particle, so they come in the order of kinds, but for those that are held.
+        """
         first, number = self.list.first[i], self.list.number[i]
-        for turn in range(ti.static(4 if self.divided else 2)):
-            kind = turn if ti.static(self.divided) else 2 * turn + 1
-            if kind == MOVED:
-                self.own[i] = row
-            for e in range(first, first + number):
+        own, kept, some_held = row, row, 0
+        for held in range(2):
+            for e in range(first, first + number * ti.max(1 - held, some_held)):
                 j = self.list.neighbour[e]
-                if self.kind_of(i, j, begin, end) == kind:
+                kind = self.kind_of(i, j, begin, end)
+                some_held |= ti.cast(kind == HELD, ti.i32)
+                if kind != LISTED and (kind == HELD) == (held == 1):
                     before = row
                     row = self.find_pair(i, j, e, row, scale)
+                    if kind == BEFORE:
+                        own = row
+                    if kind <= MOVED:
+                        kept = row
                     if kind == MOVED and row > before:
                         self.share[j] = self.share[j] + 1
                         self.spread[j] = self.spread[j] + self.square(self.normal.field[before])
-            if kind == MOVED:
-                self.kept[i] = row
+        self.own[i], self.kept[i] = own, kept
         return row
 
     @ti.func
@@ -458,15 +464,15 @@ class Rows:
         rr, near = r.dot(r), distance + ti.static(SLOP) * least
         # Nearest on the way: what passes each other within the substep touches there.
         uu, ru, start = u.dot(u), r.dot(u), r - u
-        passes = ru > 0 and ru < uu and rr * uu - ru * ru < distance * distance * uu
+        passes = (ru > 0) & (ru < uu) & (rr * uu - ru * ru < distance * distance * uu)
         # Where one of them is stopped, the other one goes on. Only pairs that a valid list has for sure.
         goes = ti.max(-start.dot(self.state.d[i]), start.dot(self.state.d[j]))
         reach = distance + ti.min(ti.static(AHEAD) * least, self.ahead)
-        ahead = start.dot(start) - distance * distance < 2 * goes and rr < reach * reach
+        ahead = (start.dot(start) - distance * distance < 2 * goes) & (rr < reach * reach)
         if ti.static(bool(self.impacts)):  # what is struck may go anywhere
             reach = distance + self.ahead
             ahead = rr < reach * reach
-        lists = rr < near * near or self.is_set(p) or passes or ahead
+        lists = (rr < near * near) | self.is_set(p) | passes | ahead  # without branches: half of the pairs are apart
         if ti.static(not self.table.uniform):
             lists = lists and ti.cast(self.table.of(i, j)[TOUCH], ti.i32) == TOUCHES
         if lists:
