@@ -8,6 +8,7 @@ from .. import checks
 from ..checks import ArrayLike
 from ..device import ti
 from ..features.feature import Knob, Scene
+from ..features.items import Items
 from ..geometry.intervals import cross, cross_2d
 from ..particles import Particles
 from .core.members import Members, rows
@@ -39,7 +40,7 @@ class Area(Scalar):
     index_name = "loops"
     each = (*Scalar.each, "pressure")
     pressure, goal = PRESSURE, GOAL
-    rest = Knob(lambda f, v: checks.per_item("Area", "rest", v, f.count, least=0.0), "Area at pressure 1 [m^2].")
+    rest = Knob(Items("rest", least=0.0), "Area at pressure 1 [m^2].")
 
     def __init__(
         self, loops, rest=None, *, pressure: ArrayLike = 1.0, compliance: ArrayLike = 0.0, damping: ArrayLike = 0.0,

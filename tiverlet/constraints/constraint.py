@@ -10,6 +10,7 @@ from ..checks import ArrayLike
 from ..device import ti
 from ..device.language import undecorated
 from ..features.feature import Knob, Scene
+from ..features.items import Items
 from ..particles import Particles
 from ..tools import golden
 from .core.finite_differences import NumericGradient
@@ -89,7 +90,7 @@ class Constraint(Scalar):
     can_extend = False  # the function may read the number of a constraint
     _size = 0.0  # of the part of the scene that it acts on [m]
     _measured: tuple[Any, Any] = (None, None)  # positions, and values and gradients there
-    rest = Knob(lambda f, v: checks.per_item(repr(f), "rest", v, f.count), "What function should be.")
+    rest = Knob(Items("rest"), "What function should be.")
 
     @property
     def is_fixed_in_space(self) -> bool:  # type: ignore[override]

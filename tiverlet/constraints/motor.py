@@ -7,13 +7,19 @@ import numpy as np
 from .. import checks
 from ..checks import ArrayLike
 from ..features.feature import Feature, Knob, Scene
+from ..features.items import Items
 from ..particles import Particles
 from .core.angle import TURN, DihedralAngle, PathAngle
-from .core.drive import Drive, driven_rest, largest_load
+from .core.drive import Drive, driven_rest
 from .core.scalar import Scalar
 
 TIME_CONSTANT = 0.1  # [s] time constant with which a servo approaches its angle
 PLACED = 0.2  # [rad] hinges that were placed further than this from their rest angle continue from their new angle
+
+
+def _refuse_endless(motor: Any, angle: np.ndarray) -> None:
+    if not motor.serves:
+        raise ValueError("Motor: angle cannot be set: it turns at a speed. Make a Motor with angle=... for one that holds it.")
 
 
 class Motor(Scalar):
@@ -45,11 +51,10 @@ class Motor(Scalar):
     index_name = "hinges"
     driven = True
     each = ("speed", "angle", "torque", "compliance", "damping", "break_at")
-    uploads_all = False  # goals are computed for a single world
-    speed = Knob(lambda f, v: checks.per_item("Motor", "speed", v, f.count), "Angular velocity [rad/s].")
-    angle = Knob(lambda f, v: f._angle(v), "Where to turn to [rad].")
+    speed = Knob(Items("speed"), "Angular velocity [rad/s].")
+    angle = Knob(Items("angle", _refuse_endless, least=-TURN, most=TURN), "Where to turn to [rad].")
     rest = driven_rest("_begin", "The current rest angles [rad], (m,).")
-    torque = Knob(lambda f, v: largest_load(f, "torque", v), "The largest torque [N m].")
+    torque = Knob(Items("torque", least=0.0, infinite=True), "The largest torque [N m].")
 
     def __init__(
         self, hinges, speed: ArrayLike, *, angle=None, torque: ArrayLike = np.inf, compliance: ArrayLike = 0.0, damping:
@@ -68,13 +73,6 @@ class Motor(Scalar):
         super().check_extension(more)
         if more.serves != self.serves:  # type: ignore[attr-defined]
             raise TypeError("World.add: extend: one Motor turns to an angle, and the other at a speed. Add it to features.")
-
-    def _angle(self, value) -> np.ndarray:
-        if not self.serves:
-            raise ValueError(
-                "Motor: angle cannot be set: it turns at a speed. Make a Motor with angle=... for one that holds it."
-            )
-        return checks.per_item("Motor", "angle", value, self.count, least=-TURN, most=TURN)
 
     def prepare(self, particles: Particles, inv_mass: np.ndarray) -> None:
         """Check the indices and angles against the dimension, and take the initial angles as rest angles."""

@@ -8,6 +8,7 @@ from .. import checks
 from ..checks import ArrayLike
 from ..device import ti
 from ..features.feature import Knob, Scene
+from ..features.items import Items
 from ..geometry.common_sense import edges_of, oriented
 from ..geometry.intervals import cross
 from ..particles import Particles
@@ -42,7 +43,7 @@ class Volume(Scalar):
     for_users = ("faces",)
     each = (*Scalar.each, "pressure")
     pressure, goal = PRESSURE, GOAL
-    rest = Knob(lambda f, v: checks.per_item("Volume", "rest", v, f.count, least=0.0), "Volume at pressure 1 [m^3].")
+    rest = Knob(Items("rest", least=0.0), "Volume at pressure 1 [m^3].")
 
     def __init__(
         self, cells, rest=None, *, pressure: ArrayLike = 1.0, compliance: ArrayLike = 0.0, damping: ArrayLike = 0.0,

@@ -7,8 +7,9 @@ import numpy as np
 from .. import checks
 from ..checks import ArrayLike
 from ..features.feature import Knob, Scene
+from ..features.items import Items
 from ..particles import Particles
-from .core.drive import Drive, driven_rest, largest_load
+from .core.drive import Drive, driven_rest
 from .core.length import Length
 from .core.scalar import Scalar
 
@@ -37,12 +38,11 @@ class Winch(Scalar):
     driven = True
     cusp = False  # no length of a winch is 0
     each = ("speed", "length", "shortest", "longest", "force", "compliance", "damping", "break_at")
-    uploads_all = False  # goals are computed for a single world
-    speed = Knob(lambda f, v: checks.per_item("Winch", "speed", v, f.count), "Change of length [m/s].")
-    shortest = Knob(lambda f, v: checks.per_item("Winch", "shortest", v, f.count, above=0.0), "Least length [m].")
-    longest = Knob(lambda f, v: checks.per_item("Winch", "longest", v, f.count, above=0.0, infinite=True), "Largest length [m].")
+    speed = Knob(Items("speed"), "Change of length [m/s].")
+    shortest = Knob(Items("shortest", above=0.0), "Least length [m].")
+    longest = Knob(Items("longest", above=0.0, infinite=True), "Largest length [m].")
     rest = driven_rest("length", "The current lengths [m], (m,).")
-    force = Knob(lambda f, v: largest_load(f, "force", v), "The largest pull [N].")
+    force = Knob(Items("force", least=0.0, infinite=True), "The largest pull [N].")
 
     def __init__(
         self, pairs, speed: ArrayLike = 0.0, *, length=None, shortest=None, longest: ArrayLike = np.inf, force:

@@ -8,6 +8,7 @@ import numpy as np
 
 from ..features.arguments import knobs_of
 from ..features.feature import Feature
+from ..features.items import Items
 from ..features.unknown_names import owners_of, suggest
 
 if TYPE_CHECKING:
@@ -86,25 +87,45 @@ class Knobs:
                 has = "one value" if one else f"{len(values)} values"
                 raise ValueError(f"Worlds.set: {name} has {has}, but there are {len(chosen)} worlds. Give each its own.")
             knob, before = getattr(type(f), name), vars(f)[name]
-            every = list(before) if (i, name) in self._given else [before] * self.count
-            k = -1
-            try:
-                for k, value in zip(chosen, values, strict=True):
-                    with self.shown(k):  # knobs are checked against other knobs of the same world
-                        every[k] = knob.check(f, value)
-                        if not f.uploads_all:
-                            _check_fits(f, name, every[k])
-                together = _stacked(every)
-                if f.uploads_all:
-                    k = -1
-                    _check_fits(f, name, together)
-            except (ValueError, TypeError) as error:
-                if k >= 0:
-                    error.add_note(f"That is what Worlds.set was given for world {k}.")
-                raise
+            every = before if (i, name) in self._given else [before] * self.count
+            together = self._checked_at_once(f, knob, every, chosen, values)
+            if together is None:
+                together = self._checked_each(f, knob, list(every), chosen, values)
             vars(f)[name] = self._given[i, name] = together
             self._flags[chosen, i, CHANGED] = True
             self._flags[chosen, i, FORCED] |= knob.force
+
+    def _checked_at_once(self, f: Feature, knob: Any, every: Any, chosen: np.ndarray, values: Any) -> np.ndarray | None:
+        """Return the values of all worlds, (worlds, m), with these in the chosen ones; None where each is to be checked alone."""
+        if not (f.uploads_all and isinstance(knob.check, Items)):
+            return None
+        try:
+            values = knob.check.of_worlds(f, np.asarray(values))
+        except (ValueError, TypeError):  # let the world be named whose value is wrong
+            return None
+        together = np.array(every)
+        together[chosen] = values
+        _check_fits(f, knob.name, together)
+        return together
+
+    def _checked_each(self, f: Feature, knob: Any, every: list[Any], chosen: np.ndarray, values: Any) -> Any:
+        """Return the values of all worlds, stacked, with these in the chosen ones, after each has been checked in its world."""
+        k = -1
+        try:
+            for k, value in zip(chosen, values, strict=True):
+                with self.shown(k):  # knobs are checked against other knobs of the same world
+                    every[k] = knob.check(f, value)
+                    if not f.uploads_all:
+                        _check_fits(f, knob.name, every[k])
+            together = _stacked(every)
+            if f.uploads_all:
+                k = -1
+                _check_fits(f, knob.name, together)
+        except (ValueError, TypeError) as error:
+            if k >= 0:
+                error.add_note(f"That is what Worlds.set was given for world {k}.")
+            raise
+        return together
 
     def check_kernels(self) -> None:
         """Raise ValueError if a knob that was assigned for all worlds needs other kernels; for the world that is shown."""

@@ -8,6 +8,7 @@ import numpy as np
 from ... import checks
 from ...device.interrupts import in_turn
 from ...features.feature import Batch, Feature, Knob, Scene
+from ...features.items import Items
 from ...features.regrouping import Regrouping
 from .anchor_passes import AnchorPasses, Place
 from .members import Members
@@ -40,7 +41,7 @@ class Anchored(Batch):
     uploads_all = True
     exclusive = False  # no other feature may hold its particles
     compliance = Knob(lambda f, v: f._compliance(v), "Inverse stiffness [m/N].", force=True)
-    damping = Knob(lambda f, v: checks.per_item(repr(f), "damping", v, f.count, least=0.0), "Of the dashpot [N s/m].", force=True)
+    damping = Knob(Items("damping", least=0.0), "Of the dashpot [N s/m].", force=True)
     compiled_for = ("soft",)
     _soft_cache: tuple[Any, bool] = (None, False)  # compliances, and whether any of them is above 0
 

@@ -8,6 +8,7 @@ import numpy as np
 from ... import checks
 from ...device import called_with, inline, ti
 from ...features.feature import Knob, Scene
+from ...features.items import Items
 from ...geometry.intervals import cross, cross_2d
 from .quantity import Quantity, exact_rest
 
@@ -16,7 +17,7 @@ LEAST_SINE = 1e-13  # of unit vectors u and v: |u x v| below which f64 loses the
 SHORT = 1e-24  # [m^2] squared length below which a link has no direction: representable in f32, and far below any in use
 
 
-REST_ANGLE = Knob(lambda f, v: checks.per_item(repr(f), f.rest_name, v, f.count, least=-TURN, most=TURN), "Rest angle [rad].")
+REST_ANGLE = Knob(Items(None, least=-TURN, most=TURN), "Rest angle [rad].")
 
 
 def angles_of_paths(batch: Any, name: str, value: Any, dim: int | None = None) -> np.ndarray:

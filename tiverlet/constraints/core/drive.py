@@ -4,20 +4,14 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from ... import checks
 from ...device import ti
 
 if TYPE_CHECKING:
-    from ...features.feature import Batch, Scene
+    from ...features.feature import Scene
 
 LARGEST = 1e30  # stands for infinity on the device, whose compilers assume finite numbers
 STALL = 0.25  # of its size: beyond this violation, if no spring bears it, the rest value waits for the constraint
 APART = 0.45  # of a period: the largest lag, since beyond half a period an equivalent value is nearer
-
-
-def largest_load(batch: "Batch", name: str, value: Any) -> np.ndarray:
-    """Return the largest load as the user gives it, checked: (m,), infinite for no limit."""
-    return checks.per_item(repr(batch), name, value, batch.count, least=0.0, infinite=True)
 
 
 def driven_rest(begin: str, text: str) -> property:

@@ -4,24 +4,22 @@ from typing import TYPE_CHECKING, Any, TypeGuard
 
 import numpy as np
 
-from ... import checks
 from ...device import ti
 from ...features.feature import Knob
+from ...features.items import Items
 from .quantity import Quantity, exact_rest
 
 if TYPE_CHECKING:
     from .scalar import Scalar
 
 
-def lengths_of(batch: Any, value: Any) -> np.ndarray:
-    """Return rest lengths as the user gives them, checked, (m,); in a periodic box they are below half of it."""
-    out = checks.per_item(repr(batch), batch.rest_name, value, batch.count, least=0.0)
-    if batch.periodic is not None and batch.count:
-        batch.periodic.refuse(repr(batch), f"link {int(out.argmax())} holds particles", float(out.max()), "links", True)
-    return out
+def refuse_long(batch: Any, length: np.ndarray) -> None:
+    """Raise ValueError for rest lengths [m] of half of a periodic box, or more."""
+    if batch.periodic is not None and len(length):
+        batch.periodic.refuse(repr(batch), f"link {int(length.argmax())} holds particles", float(length.max()), "links", True)
 
 
-REST_LENGTH = Knob(lengths_of, "Rest length [m].")
+REST_LENGTH = Knob(Items(None, refuse_long, least=0.0), "Rest length [m].")
 
 
 class Length(Quantity):

@@ -4,14 +4,14 @@ from typing import Any
 
 import numpy as np
 
-from ... import checks
 from ...device import ti
 from ...features.feature import FAR, Knob, Scene
+from ...features.items import Items
 from .equation import Equation
 from .passes import Passes
 
 GOAL = property(lambda f: f.pressure * f.rest, doc="The target values of f, pressure * rest, (m,).")
-PRESSURE = Knob(lambda f, v: checks.per_item(repr(f), "pressure", v, f.count, least=0.0), "Factor on the rest value.")
+PRESSURE = Knob(Items("pressure", least=0.0), "Factor on the rest value.")
 
 
 class OutlinePasses(Passes):

@@ -9,6 +9,7 @@ from ... import checks
 from ...device.interrupts import in_turn
 from ...features.feature import Batch, Knob, Scene
 from ...features.flag import BREAKS, SOFT, Flag
+from ...features.items import Items
 from ...features.read_only import as_read_only, assign_whole_advice
 from ...features.regrouping import Regrouping
 from ...geometry.ordered import distinct
@@ -43,10 +44,8 @@ class Scalar(Batch):
     quantity: Quantity  # f of the batch's constraints
     side = 0  # 0: C = 0;  1: C <= 0, pulls when f > rest;  -1: C >= 0, pushes when f < rest
     rest: Any  # a Knob in each constraint: (m,) array
-    compliance = Knob(
-        lambda f, v: checks.per_item(repr(f), "compliance", v, f.count, least=0.0, most=SOFTEST), "Of springs.", force=True
-    )
-    damping = Knob(lambda f, v: checks.per_item(repr(f), "damping", v, f.count, least=0.0), "Of the dashpot.", force=True)
+    compliance = Knob(Items("compliance", least=0.0, most=SOFTEST), "Of springs.", force=True)
+    damping = Knob(Items("damping", least=0.0), "Of the dashpot.", force=True)
     break_at = Knob(strength_of, "Load beyond which a constraint breaks, (m,); None for never.")
     compiled_for = ("soft", "rigid", "damped", "breaks", "limited", "cusp", "capped")
     soft, breaks = SOFT, BREAKS
