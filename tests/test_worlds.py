@@ -145,6 +145,16 @@ def test_a_list_that_is_too_short_in_one_grows_in_all_and_what_is_wrong_in_one_i
         assert [many.hash(k) for k in range(4)] == [w.hash() for w in alone]
 
 
+def driven():
+    """A motor, a winch and a servo with limited loads, in a wind."""
+    x = [(0, 0), (1, 0), (2, 0), (3, 0), (3, -1), (5, 0), (6, 0), (7, 0)]
+    motor, servo = tv.Motor([(0, 1, 2)], 1.0, torque=2.0), tv.Motor([(5, 6, 7)], 2.0, angle=0.1, torque=5.0)
+    links, winch = tv.Distance([(1, 2), (6, 7)]), tv.Winch([(3, 4)], 0.5, force=20.0)
+    wind = tv.Wind((0.5, 0.0), rate=0.3)
+    start = tv.Particles(x, pinned=[0, 1, 3, 5, 6])
+    return tv.World(start, [tv.Gravity(), links, wind, motor, winch, servo], substeps=6)
+
+
 # Number of a feature, its knobs with a value for each of some worlds, and which; for all three by default.
 CHANGES = {
     pendulum: [
@@ -156,6 +166,12 @@ CHANGES = {
         (2, {"friction": [0.1, (0.4, 0.3), 0.2]}), (2, {"restitution": [0.3, 0.2, 0.1]}),
         (3, {"target": [[(9.0, 2.5)], [(9.5, 2.0)], [(9.0, 1.5)]]}), (1, {"active": [False, True, True]}),
         (1, {"offset": [0.1, 0.0], "restitution": [0.5, 0.0]}, [0, 1]), (1, {"active": [False, False, False]}),
+    ],
+    driven: [
+        (3, {"torque": [[0.5], [3.0], [1.0]], "speed": [1.0, -1.0, 2.0]}),
+        (4, {"force": [2.0, 0.0], "longest": [1.5, 3.0]}, [2, 0]), (5, {"angle": [0.4, -0.3, 0.2]}),
+        (2, {"velocity": [(1.0, 0.0), (0.0, 2.0), (-1.0, 0.5)]}), (3, {"torque": [4.0]}, [1]), (1, {"rest": [1.1, 0.9, 1.0]}),
+        (0, {"g": [4.0, 5.0]}, [0, 1]),
     ],
 }  # fmt: skip
 

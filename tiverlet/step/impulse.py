@@ -74,18 +74,18 @@ class Displacements:
 
     def give(
         self, want: np.ndarray, velocity: Callable[[], np.ndarray], factor: np.ndarray, seen: np.ndarray | None = None,
-        change: float = 0.0,
+        change: float | np.ndarray = 0.0,
     ) -> np.ndarray:  # fmt: skip
         """Change displacements until they give velocities `want`, (worlds, ..., dim) [m/s]. Returns where they do, (worlds,).
 
         One round suffices, and a second removes the rounding of the first. Where forces read velocities, rounds are repeated
         until the error falls no further. velocity: computes the velocities of the present displacements. factor: of each world,
-        see factor(). seen: the first result of velocity(), if it is known. change: the largest change of velocities [m/s], if the
-        error may be relative to that.
+        see factor(). seen: the first result of velocity(), if it is known. change: the largest change of velocities [m/s], or
+        that of each world, if the error may be relative to it.
         """
         more = best = np.zeros(want.shape)
         least, factor = np.full(len(want), np.inf), factor.reshape(-1, 1, 1)
-        largest = np.abs(want).max(axis=(1, 2), initial=change)
+        largest = np.maximum(np.abs(want).max(axis=(1, 2), initial=0.0), change)
         enough = DIGITS * np.finfo(self.was[self.field].dtype).eps * largest if self.again else 0.0
         for _ in range(ROUNDS if self.again else 2):
             lack = np.where(self.some, want - (velocity() if seen is None else seen), 0.0)

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from ..features.arguments import knobs_of
-from ..features.feature import Feature
+from ..features.feature import Acceleration, Feature
 from ..features.items import Items
 from ..features.unknown_names import owners_of, suggest
 
@@ -146,6 +146,17 @@ class Knobs:
     def any_moves(self) -> bool:
         """Whether a target moves in the coming frame, in any world."""
         return bool(self._flags[..., MOVING].any())
+
+    def changed_forces(self) -> list[Any]:
+        """Return the forces that wait in any world, where all that waits beside them uploads for all worlds."""
+        changed, _, forced = np.any(self._flags, axis=0).T
+        some = self._some(changed)
+        forces = [f for f in some if isinstance(f, Acceleration)]
+        return forces if not forced.any() and all(f.uploads_all for f in some if f not in forces) else []
+
+    def note_uploaded(self, forces: list[Any]) -> None:
+        """Note that these wait no more."""
+        self._flags[:, [self.features.index(f) for f in forces], CHANGED] = False
 
     def upload_to_all(self) -> bool:
         """Upload the knobs of all worlds at once if features can. Returns False if each world has to be uploaded by itself."""

@@ -21,7 +21,7 @@ from ..step import checkpoint, energy_bound, impulse
 from ..step import frames as kernel
 from ..step.clock import CHANGED, energy_floor, energy_limit, exceeds, falls_short, initial_margin, is_as_long
 from ..step.diagnostics import ENERGY, EXTENT, KINETIC, OVERLAP, SOFTENED, STARTED, STEPPED, TURNS, UNSTEPPED, risks
-from ..step.integrator import shares_of
+from ..step.integrator import decay, shares_of
 from ..world import World
 from .clocks import NONE, Clocks
 from .knobs import Knobs
@@ -236,14 +236,53 @@ class Worlds:
             return
         with self._as_world(0):
             self._knobs.check_kernels()
+        self._take_forces(np.flatnonzero(waiting))
         if self._knobs.upload_to_all():
             self._clocks.bound[waiting] = CHANGED
             self._runner.find_ramps()
             return
-        for k in np.flatnonzero(waiting):
+        for k in np.flatnonzero(self._knobs.waiting):
             with self._as_world(k) as world:
                 world._find_stiffened()
                 world._upload_parameters()
+
+    def _take_forces(self, some: np.ndarray) -> None:
+        """Write forces to the device that have changed in the worlds `some`, and keep velocities, as World._take_forces() does.
+
+        It does nothing where some world needs a start for it.
+        """
+        runner, clocks, knobs, forces = self._runner, self._clocks, self._knobs, self._knobs.changed_forces()
+        h, drag = clocks.h[some], clocks.drags[some]
+        if not forces or runner.sleep or runner.probe or (clocks.d_is_velocity | clocks.overridden)[some].any():
+            return
+        values, rates = [], np.zeros(len(self))
+        for k in range(len(self)):
+            with knobs.shown(k):
+                values.append([f.kernel_values() for f in forces])
+                rates[k] = sum(f.rate for f in runner.drags)
+        same = [clocks.drag[k] == (decay(float(rates[k]), float(clocks.h[k])) if runner.drags else None) for k in some]
+        if not all(same) or (drag[:, 0] < impulse.WEAK).any():
+            return
+        want = self._velocities()[some]
+        for i, f in enumerate(forces):
+            for name in values[0][i]:
+                runner.memory.write(vars(f.dev)[name], np.array([each[i][name] for each in values])[:, None])
+        seen = self._velocities()[some]
+        those = self._displacements(some, (seen != want).any(axis=2))
+        change = np.abs(want - seen).max(axis=(1, 2), initial=0.0)
+        found = those.give(want, lambda: self._velocities()[some], impulse.factor(h, drag), seen, change)
+        self._start_from(want[~found], some[~found])
+        knobs.note_uploaded(forces)
+        clocks.bound[some], clocks.needs_drag[some] = CHANGED, False
+
+    def _displacements(self, some: np.ndarray, moves: Any) -> impulse.Displacements:
+        """Return the displacements of the particles in the mask `moves`, (some, n), that can move, of the worlds `some`."""
+        memory, n = self._runner.memory, self._runner.n
+        inv_mass = [self._sources[k].inv_mass for k in some] if self._sources else self._runner.scene.inv_mass
+        return impulse.Displacements(
+            self._runner, moves & (np.asarray(inv_mass) > 0), lambda field: memory.read(field)[some, :n],
+            lambda field, v: memory.write_some(field, v, some),
+        )  # fmt: skip
 
     def _launch(
         self, dt: float, substeps: int, frames: int, moved: np.ndarray, released: np.ndarray, every: int = 0,
@@ -558,16 +597,12 @@ class Worlds:
         drag = clocks.drags[chosen]
         steered = moved & ~clocks.d_is_velocity[chosen] & (not runner.probe) & (drag[:, 0] >= impulse.WEAK)
         if steered.any():
-            some, memory, n = chosen[steered], runner.memory, runner.n
+            some, memory = chosen[steered], runner.memory
             clocks.velocity_override[some] = None
             want, seen, change, drag = velocity[steered], seen[steered], change[steered], drag[steered]
-            inv_mass = [self._sources[k].inv_mass for k in some] if self._sources else runner.scene.inv_mass
-            moves = change.any(axis=2) & (np.asarray(inv_mass) > 0)
             had, free = (self._velocities(touches=touches)[some] for touches in (True, False))
             bare = self._velocities(links=False, touches=False)[some] if runner.batches else free
-            those = impulse.Displacements(
-                runner, moves, lambda field: memory.read(field)[some, :n], lambda field, v: memory.write_some(field, v, some)
-            )
+            those = self._displacements(some, change.any(axis=2))
             with self._knobs.shown(0):
                 friction = impulse.has_friction(runner)
                 pulled = impulse.pulled(runner, len(some), lambda field: memory.read(field)[some])
