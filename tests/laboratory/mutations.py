@@ -77,7 +77,7 @@ FAULTS = (
     Fault("34775e33", "friction does not act where discs land: heaps half as steep", "contact/impulses.py",
           "(normal + self.rows.hit(row))", "(normal / 2 + self.rows.hit(row))", "grains rows statics"),
     Fault("3a993469", "a pair that passes within a substep is no row", "contact/rows.py",
-          "or passes or ahead", "or ahead", "contact"),
+          "| passes | ahead", "| ahead", "contact"),
     Fault("786a5f7c", "what lies still under a blow is told to move", "contact/impulses.py",
           "- self.excess(change - push + kick, change + kick)", "", "velocity rows"),
     Fault("02d0371e", "old overlap is a reason for an impulse", "contact/rows.py",
