@@ -60,7 +60,7 @@ def test_the_price_list_has_the_fields_and_bytes_of_today(taichi):
 def test_faults_that_can_be_put_back_are_where_they_were():
     for fault in mutations.FAULTS:
         assert (mutations.ROOT / "tiverlet" / fault.file).read_text().count(fault.now) == 1, fault
-        assert all((mutations.ROOT / "tests" / f"test_{test}.py").exists() for test in fault.tests.split()), fault
+        assert all(mutations.file_of(test) for test in fault.tests.split()), fault
 
 
 @pytest.mark.slow

@@ -38,6 +38,103 @@ def test_each_contact_of_a_pyramid_bears_what_statics_says(world):
     np.testing.assert_allclose(found.impulse * 480, borne, atol=LOADS * borne.max())
 
 
+def heap(world, dim, precision, box=None):
+    """Return a heap of grains with friction and spin at rest on pinned ones, and the mask of those that touch no wall."""
+    n, side = (60, 8) if dim == 2 else (80, 4)
+    rng, k = np.random.default_rng(3), np.arange(n)
+    radius = rng.uniform(0.4, 0.6, n)
+    at = np.stack([k % side, k // side] if dim == 2 else [k % side, k // side**2, k // side % side], axis=1)
+    x = at * 1.25 + 0.7 + rng.uniform(-0.02, 0.02, (n, dim))
+    x[:, 1] += 0.7
+    floor = np.stack([*map(np.ravel, np.meshgrid(*[np.arange(side * 1.25)] * (dim - 1)))], axis=1)
+    floor = np.insert(floor, 1, 0.0, axis=1) if dim == 3 else np.stack([floor[:, 0], np.zeros(len(floor))], axis=1)
+    everywhere = [tv.Contact(friction=0.4), *(box or [tv.HalfSpace(s * np.eye(dim)[k], -0.2 if s > 0 else -side * 1.25 - 0.2)
+                  for s in (1, -1) for k in range(dim) if k != 1])]  # fmt: skip
+    radius = np.r_[np.full(len(floor), 0.5), radius]
+    start = tv.Particles(np.r_[floor, x], radius=radius, mass=radius**dim, pinned=range(len(floor)), spin=True)
+    w = world(start, [tv.Gravity((0, -G) if dim == 2 else (0, -G, 0)), *everywhere], precision=precision, substeps=10)
+    w.run(25.0)
+    inside = w.position[:, [k for k in range(dim) if k != 1]]
+    away = ((inside > radius[:, None] - 0.15) & (inside < side * 1.25 + 0.15 - radius[:, None])).all(axis=1)
+    return w, (np.arange(len(radius)) >= len(floor)) & (away if box is None else True)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("dim, precision, off", [(2, "f64", 1e-9), (2, "f32", LOADS), (3, "f64", LOADS), (3, "f32", LOADS)])
+def test_contacts_hold_each_grain_of_a_heap(world, dim, precision, off):
+    # sum f + m g = 0 and sum r x f = 0, with f = impulse n + tangential on the first of a pair and -f on the second, in the
+    # middle of each contact. Walls are no contacts of pairs, so grains at walls are left out. Spheres go on turning about the
+    # vertical, which nothing resists.
+    w, some = heap(world, dim, precision)
+    found, r, weight = w.contacts, np.asarray(w.particles.radius), G * w.particles.mass
+    f = 600 * (found.impulse[:, None] * found.normal + found.tangential)
+    force, moment = np.zeros((2, len(r), dim))
+    moment = moment if dim == 3 else moment[:, :1]
+    for k, sign in ((0, 1), (1, -1)):
+        i = found.pairs[:, k]
+        np.add.at(force, i, sign * f)
+        arm = -r[i, None] * found.normal  # from the second one it is r n, and the force is -f
+        np.add.at(moment, i, np.cross(arm, f) if dim == 3 else (arm[:, 0] * f[:, 1] - arm[:, 1] * f[:, 0])[:, None])
+    force[:, 1] -= weight
+    assert some.sum() > 20 and np.abs(found.tangential).max() > 0.05 * found.impulse.max()
+    assert (np.linalg.norm(force, axis=1) < off * weight)[some].all()
+    assert (np.linalg.norm(moment, axis=1) < off * weight * r)[some].all()
+    assert tv.measure.coordination(w) > (3 if dim == 2 else 4) - 0.5  # d + 1 where friction holds all of it
+
+
+@pytest.mark.slow
+def test_stress_is_the_force_through_planes(world):
+    # In a heap between periodic sides, planes y = c carry the weight of the grains whose centers are above c; the mean over a
+    # slab counts each grain by the part of the slab below it. On the whole nothing pushes to a side.
+    box = tv.Periodic((0, 0), (10, 1), axes=(0,))
+    w, _ = heap(world, 2, "f64", [box])
+    x, weight = w.position, G * w.particles.mass
+    for low, high in ((1.0, 2.0), (2.3, 2.6), (4.0, 9.0)):
+        found = tv.measure.stress(w, [(0, low), (10, high)])
+        borne = (weight * np.clip((x[:, 1] - low) / (high - low), 0, 1))[w.particles.inv_mass > 0].sum() / 10
+        np.testing.assert_allclose(found.total[:, 1], [0, borne], atol=1e-6 * weight.sum())
+        left, right = (tv.measure.stress(w, [(a, low), (b, high)]).total[1, 1] for a, b in ((0, 4), (4, 10)))
+        assert left * 0.4 + right * 0.6 == pytest.approx(found.total[1, 1], rel=1e-12)
+
+
+def test_what_moves_presses_by_its_fluctuations(world):
+    # P V = sum m v v^T about the mean velocity, T = sum m v^2 / dim sum m; a linear profile of a sheared box is none.
+    rng = np.random.default_rng(0)
+    x, v, mass = rng.uniform(0, 8, (20, 3)), rng.normal(size=(20, 3)), rng.uniform(1, 2, 20)
+    w = world(tv.Particles(x, velocity=v + 5, mass=mass), [], precision="f64")
+    free = v - mass @ v / mass.sum()
+    found = tv.measure.stress(w, [(0, 0, 0), (8, 8, 8)])
+    np.testing.assert_allclose(found.total, free.T @ (mass[:, None] * free) / 512, rtol=1e-12)
+    assert not found.contact.any() and tv.measure.granular_temperature(w) == pytest.approx(
+        mass @ free**2 @ [1, 1, 1] / 3 / mass.sum()
+    )
+    sheared = tv.Periodic((0, 0, 0), (8, 8, 8), shear=0.5)
+    w = world(
+        tv.Particles(x, velocity=np.stack([x[:, 1] / 2, *np.zeros((2, 20))], axis=1), mass=mass), [sheared], precision="f64"
+    )
+    assert np.abs(tv.measure.stress(w).total).max() < 1e-12 and tv.measure.granular_temperature(w) < 1e-12
+    with pytest.raises(ValueError, match="no volume"):
+        tv.measure.stress(world(tv.Particles(x), []))
+    with pytest.raises(ValueError, match="sheared box moves"):
+        tv.measure.stress(w, [(0, 0, 0), (1, 1, 1)])
+
+
+def test_edges_tell_of_friction_too(world):
+    # A brick sticks to a pinned slab, where gravity leans by 20 degrees: its corners bear m g cos a, and m g sin a across.
+    a = np.radians(20)
+    brick, slab = tv.shapes.box((0, 0.105), (0.4, 0.2)), tv.shapes.box((0, -0.5), (4, 1))
+    body, _ = tv.shapes.join(slab, brick)
+    gravity = tv.Gravity((G * np.sin(a), -G * np.cos(a)))
+    start = tv.Particles(body.position, pinned=range(4))
+    w = world(
+        start, [gravity, tv.Polygons(body.loops, friction=0.5), tv.ShapeMatch(body.loops[1:])], precision="f64", substeps=20
+    )
+    w.run(1.0)
+    found, weight = w.contacts, 4 * G
+    assert found.impulse.sum() * 1200 == pytest.approx(weight * np.cos(a), rel=1e-6)
+    np.testing.assert_allclose(1200 * found.tangential.sum(axis=0), [-weight * np.sin(a), 0], atol=1e-6 * weight)
+
+
 @pytest.mark.parametrize("weight", [0.02, 2.0])
 @pytest.mark.parametrize("alpha, steps", [(5e-6, 13), (1e-5, 9), (3e-5, 5), (3e-4, 2), (3e-3, 2)])
 def test_the_loads_of_a_prestressed_soft_net_are_those_of_its_lengths(world, alpha, steps, weight):

@@ -1,6 +1,7 @@
 """Physical quantities of a scene, computed from plain arrays in f64: for tests and reports."""
 
-from typing import TYPE_CHECKING, Any
+from itertools import product
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
@@ -14,8 +15,17 @@ if TYPE_CHECKING:
     from .world import World
 
 __all__ = [
-    "angular_momentum", "center_of_mass", "kinetic_energy", "moment_sum", "momentum", "overlapping", "strain", "torque",
+    "Stress", "angular_momentum", "center_of_mass", "coordination", "granular_temperature", "kinetic_energy", "moment_sum",
+    "momentum", "overlapping", "strain", "stress", "torque",
 ]  # fmt: skip
+
+
+class Stress(NamedTuple):
+    """A stress, (dim, dim) [N/m in 2D, Pa in 3D], positive where it presses, and its parts."""
+
+    total: np.ndarray
+    contact: np.ndarray
+    kinetic: np.ndarray
 
 
 def kinetic_energy(world: "World") -> float:
@@ -62,6 +72,77 @@ def strain(world: "World", pairs, rest) -> np.ndarray:
     i, j = np.asarray(pairs).T
     x = world.position
     return np.linalg.norm(between(x[i], x[j], world._runner.scene.periodic), axis=1) / np.asarray(rest) - 1
+
+
+def granular_temperature(world: "World", part=None) -> float:
+    """Return the mean square of velocity fluctuations, over the dimensions [m^2/s^2], weighted with masses.
+
+    Fluctuations are about the mean velocity, and in a sheared box about its profile. part: indices or a mask of particles; None
+    for all that can move. Raises ValueError if none of them can.
+    """
+    some = np.arange(len(world.particles)) if part is None else part
+    m = _mass(world)[some]
+    if not m.any():
+        raise ValueError("measure.granular_temperature: none of these particles can move.")
+    return float(m @ (_fluctuations(world, some) ** 2).mean(axis=1) / m.sum())
+
+
+def coordination(world: "World") -> float:
+    """Return how many contacts a particle has in the mean, of those that bear a load and of particles that have one; else 0."""
+    found = world.contacts
+    ends = np.concatenate([found.pairs, np.where(found.ends != found.pairs[:, 1], found.ends, -1)[:, None]], axis=1)
+    ends = ends[found.impulse > 0]
+    ends = ends[ends >= 0]
+    return len(ends) / len(np.unique(ends)) if len(ends) else 0.0
+
+
+def stress(world: "World", region=None) -> Stress:
+    """Return the stress of discs and spheres in a region, by Love and Weber's sum over contacts and by the motion of particles.
+
+    P = (sum f l^T + sum m v v^T) / V, with the force f on particle i, the vector l from j to i, and velocities v about the mean.
+    Of a contact counts the part of l within the region, so that P n A is the mean force through planes across n. Walls and links
+    are no part of it.
+
+    region: (lower, upper) corners of a box [m]; None for all of a box that is periodic along all axes. Raises ValueError without
+    a volume, and for a region in a sheared box.
+    """
+    box, x = world._runner.scene.periodic, world.position
+    whole = box if region is None and box is not None and np.isfinite(box.lengths).all() else None
+    if not whole and (region is None or (box is not None and box.sheared)):
+        why = "the world has no volume" if region is None else "a region of a sheared box moves"
+        raise ValueError(f"measure.stress: {why}. Give region=(lower, upper), or take a whole box that is periodic everywhere.")
+    lower, upper = np.asarray((whole.low, whole.high) if whole else region, dtype=np.float64)
+    found = world.contacts
+    i, j = found.pairs.T
+    force, way = (found.impulse[:, None] * found.normal + found.tangential) / (world._clock.h or 1.0), between(x[i], x[j], box)
+    part, inside = np.ones(len(i)), np.ones(len(x), dtype=bool)
+    if not whole:
+        place = x if box is None else box.wrap(x)
+        length = np.zeros(x.shape[1]) if box is None else np.where(np.isfinite(box.lengths), box.lengths, 0.0)
+        images = np.array([*product(*[(-1, 0, 1) if repeats else (0,) for repeats in length])]) * length
+        part = np.sum([_part_within(place[j] + by, way, lower, upper) for by in images], axis=0)
+        inside = ((lower <= place) & (place < upper)).all(axis=1)
+    v, m, volume = _fluctuations(world, inside), _mass(world)[inside], np.prod(upper - lower)
+    contact, kinetic = np.einsum("c,ca,cb->ab", part, force, way) / volume, np.einsum("i,ia,ib->ab", m, v, v) / volume
+    return Stress(contact + kinetic, contact, kinetic)
+
+
+def _fluctuations(world: "World", some: Any) -> np.ndarray:
+    """Return velocities of some particles about their mean, and about the profile of a sheared box, (k, dim) [m/s]."""
+    box, m, v = world._runner.scene.periodic, _mass(world)[some], world.velocity[some]
+    if box is not None:
+        v[:, 0] -= box.shear * world.position[some, 1]
+    return v - m @ v / (m.sum() or 1.0)
+
+
+def _part_within(begin: np.ndarray, way: np.ndarray, lower: np.ndarray, upper: np.ndarray) -> np.ndarray:
+    """Return the parts of the lines from `begin` along `way` (m, dim) that are within a box, (m,)."""
+    with np.errstate(divide="ignore", invalid="ignore"):
+        ends = np.sort(np.stack([(lower - begin) / way, (upper - begin) / way]), axis=0)  # NaN: along a face, and on it
+    first, last = np.nan_to_num(ends, nan=0.0, posinf=np.inf, neginf=-np.inf)
+    beside = ((way == 0) & ((begin < lower) | (begin >= upper))).any(axis=1)
+    out = np.minimum(last.min(axis=1, initial=1.0), 1.0) - np.maximum(first.max(axis=1, initial=0.0), 0.0)
+    return np.where(beside, 0.0, np.maximum(out, 0.0))
 
 
 def overlapping(

@@ -561,7 +561,7 @@ class World:
         if not self._runner.search:
             none, index = np.zeros(0), np.zeros((0, 2), dtype=np.int64)
             vectors = np.zeros((0, self._particles.dim))
-            return Contacts(index, index[:, 0], none, none, vectors, vectors, none)
+            return Contacts(index, index[:, 0], none, none, vectors, vectors, none, vectors)
         contact = self._runner.step.contacts[0]
         with deferred_signals:
             self._runner.list_neighbours()

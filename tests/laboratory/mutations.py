@@ -166,10 +166,14 @@ def _row(fault: Fault) -> tuple[str, ...]:
                 f"mutations: {fault.file} has {text.count(fault.now)} times what {fault.commit} mended: {fault.now!r}"
             )
         path.write_text(text.replace(fault.now, fault.then))
-        files = (next((folder / "tests").rglob(f"test_{test}.py")) for test in fault.tests.split())
-        found = next(filter(None, (_failing(folder, str(file.relative_to(folder))) for file in files)), "no test")
+        found = next(filter(None, (_failing(folder, file_of(test)) for test in fault.tests.split())), "no test")
     print(f"{fault.commit} {fault.what}: {found}", file=sys.stderr, flush=True)
     return fault.commit, fault.what, fault.tests, found, f"{time.perf_counter() - begin:.0f}"
+
+
+def file_of(test: str) -> str:
+    """Return the path of a file of tests, from the project's root; empty if there is none."""
+    return next((str(path.relative_to(ROOT)) for path in (ROOT / "tests").rglob(f"test_{test}.py")), "")
 
 
 def _failing(folder: pathlib.Path, file: str) -> str:

@@ -19,9 +19,9 @@ from tiverlet.report.output import Table
 G, FRAME, FRICTION, TURN = 9.81, 1 / 60, 0.3, 10
 HEADS = ("engine", "steps of a frame", "ms a frame", "at rest", "worst frame", "overlap", "worst", "fastest [m/s]")
 NOTES = [
-    "CPU time of a frame: the mean of 900, the median of the last hundred, and the most beyond the first ten. Overlap at the end, "
-    "mean and worst: of discs in radii of the smaller one, of corners in other boxes in half edges. Radii of 0.36 to 1 m, edges "
-    "of 0.5 to 1 m: Box2D lets bodies of any size overlap by 5 mm. pymunk: 10 iterations in each step."
+    "CPU time of a frame: the mean of 900, the median of the last hundred, and the most beyond the first ten. Overlap at the "
+    "end, mean and worst: of discs in radii of the smaller one, of corners in other boxes in half edges. Radii of 0.36 to 1 m, "
+    "edges of 0.5 to 1 m: Box2D lets bodies of any size overlap by 5 mm. pymunk: 10 iterations in each step."
 ]
 FRAMES = 900
 SIZES = {"discs": (400, 4000), "equal discs": (400,), "boxes": (100,), "towers": (20,)}

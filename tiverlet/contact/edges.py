@@ -102,6 +102,7 @@ class Edges:
         self.list: Any = None
         self.discs: Any = None
         self.impulse: Any = None  # of listed pairs in the last substep [kg m]
+        self.given: Any = None  # along the normal, with impacts, where pairs bounce
 
     @staticmethod
     def _stride(outline: Outline) -> float:
@@ -118,7 +119,7 @@ class Edges:
     def bind(self, rows: "Rows", listed: Any, discs: "DiscGeometry") -> None:
         """Store the rows, the neighbour list, and the geometry of discs."""
         self.rows, self.list, self.discs = rows, listed, discs
-        self.impulse = rows.given if rows.bounces else rows.memory
+        self.impulse, self.given = rows.memory, rows.given if rows.bounces else None
 
     # Where particles are
 
@@ -650,10 +651,10 @@ class Edges:
         """Return the contacts of the last detect(): vertices and edges, and pairs of discs, also those pushed apart since."""
         r = self.scene.particles.radius
         pairs, at = self.list.entries()
-        found, push = self.list.read(self.manifold, at), self.list.read(self.impulse, at)
-        after = self.outline.ends[:, 0]
-        some = (found[:, 0] > 0) | (push.reshape(len(push), max(1, self.impulse.width)) != 0).any(axis=1)
-        pairs, found, push = pairs[some], found[some], push[some]
+        found, p = self.list.read(self.manifold, at), self.list.read(self.impulse, at)
+        push, after = self.list.read(self.given, at) if self.given else p, self.outline.ends[:, 0]
+        some = (found[:, 0] > 0) | (push.reshape(len(push), -1) != 0).any(axis=1) if len(push) else np.zeros(0, dtype=bool)
+        pairs, found, p, push = pairs[some], found[some], p[some], push[some]
         (i, j), overlap, t, n = pairs.T, found[:, 0], found[:, 1], found[:, 2:]
         parted, no_way = overlap <= 0, (n == 0).all(axis=1)
         discs = (t <= DISCS) | (no_way & (r[i] + r[j] > 0))
@@ -664,9 +665,11 @@ class Edges:
         edge_radius = (1 - t) * r[j] + t * r[ends]
         overlap = np.where(parted, r[i] + edge_radius - (apart * n).sum(axis=1), overlap)
         point = x[i] - apart + (edge_radius - overlap / 2)[:, None] * n
-        if push.ndim > 1:
-            push = np.maximum((push * n).sum(axis=1), 0)
-        return Contacts(pairs, ends, t, overlap, n, point, push / h)
+        across = np.zeros(n.shape)
+        if p.ndim > 1:
+            along = (p * n).sum(axis=1)
+            across, push = p - along[:, None] * n, push if self.given else np.maximum(along, 0)
+        return Contacts(pairs, ends, t, overlap, n, point, push / h, across / h)
 
 
 @ti.func

@@ -20,11 +20,11 @@ class DiscGeometry:
     """The geometry of pairs of discs or spheres: C(x) = |x_i - x_j| - (r_i + r_j), normal n = (x_i - x_j) / |x_i - x_j|.
 
     The normal points from j to i. search: the NeighbourSearch that lists the pairs. impulse: of listed pairs in the last substep
-    [kg m].
+    [kg m]. given: along the normal, with impacts, where pairs bounce.
     """
 
-    def __init__(self, scene: Scene, search: "NeighbourSearch", impulse: PairData | None = None):
-        self.scene, self.search, self.list, self.impulse = scene, search, search.list, impulse
+    def __init__(self, scene: Scene, search: "NeighbourSearch", impulse: PairData | None = None, given: PairData | None = None):
+        self.scene, self.search, self.list, self.impulse, self.given = scene, search, search.list, impulse, given
         self.state, self.radius, self.real, self.senses = scene.state, scene.radius, scene.real, search.table.senses
 
     @ti.func
@@ -123,19 +123,23 @@ class DiscGeometry:
         assert self.impulse
         r = self.scene.particles.radius
         pairs, at = self.list.entries()
-        push = self.list.read(self.impulse, at)
+        push, across = self.list.read(self.impulse, at), np.zeros((len(pairs), x.shape[1]))
         if self.impulse.width:  # the whole impulse, on the side of its owner
             n = between(x[pairs[:, 0]], x[pairs[:, 1]], self.scene.periodic)
-            push = np.abs((push * n).sum(axis=1)) / np.maximum(np.linalg.norm(n, axis=1), 1e-30)
+            n /= np.maximum(np.linalg.norm(n, axis=1), 1e-30)[:, None]
+            along = (push * n).sum(axis=1)
+            across, push = (push - along[:, None] * n) * np.sign(pairs[:, 1:] - pairs[:, :1]), np.abs(along)
+        if self.given:
+            push = self.list.read(self.given, at)
         # A static particle does not store its push, nor keep a far pair on its list. The other particle of the pair does.
-        n = len(self.scene.particles)
-        keys, which = np.unique(pairs.min(axis=1) * n + pairs.max(axis=1), return_inverse=True)
-        pairs, most = np.stack(np.divmod(keys, max(n, 1)), axis=1), np.zeros(len(keys))
-        np.maximum.at(most, which.ravel(), push)
-        push = most
+        order = np.lexsort((push, pairs.max(axis=1), pairs.min(axis=1)))
+        pairs, push, across = np.sort(pairs[order], axis=1), push[order], across[order]
+        last = np.ones(len(pairs), dtype=bool)
+        last[:-1] = (pairs[1:] != pairs[:-1]).any(axis=1)
+        pairs, push, across = pairs[last], push[last], across[last]
         if self.senses:
             touch = self.search.table.pushing(self.scene.particles.group, pairs)
-            pairs, push = pairs[touch], push[touch]
+            pairs, push, across = pairs[touch], push[touch], across[touch]
         d = between(x[pairs[:, 0]], x[pairs[:, 1]], self.scene.periodic)
         length = np.linalg.norm(d, axis=1)
         overlap = r[pairs].sum(axis=1) - length
@@ -146,7 +150,7 @@ class DiscGeometry:
         normal = d / np.where(same, 1.0, length)[:, None]
         normal[same] = fallback_normals(pairs[same], d.shape[1])
         point = x[j] + (r[j] - overlap / 2)[:, None] * normal
-        return Contacts(pairs, j, np.zeros(len(j)), overlap, normal, point, push[some] / h)
+        return Contacts(pairs, j, np.zeros(len(j)), overlap, normal, point, push[some] / h, across[some] / h)
 
 
 def fallback_normals(pairs: np.ndarray, dim: int) -> np.ndarray:

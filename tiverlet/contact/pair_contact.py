@@ -152,7 +152,7 @@ class PairContact(Feature):
             scene, skin, linked, pairs, pair_data, team, dev.responses.push, reach, walls=walls, ahead=ahead
         )
         dev.list = dev.search.list
-        discs = DiscGeometry(scene, dev.search, dev.rows.given if bounces else dev.rows.memory)
+        discs = DiscGeometry(scene, dev.search, dev.rows.memory, dev.rows.given if bounces else None)
         dev.geometry = edges or discs
         if dev.events:
             dev.events.bind(dev.list, discs)

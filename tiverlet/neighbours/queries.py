@@ -28,9 +28,9 @@ class Contacts:
     (m,), the particle at the end of the edge; j for discs. place: (m,), the position on the edge, 0 at its begin and 1 at its
     end, outside that range where two corners cross; 0 for discs. overlap: (m,) [m], 0 or less for pairs that have just been
     pushed apart. normal: (m, dim), from j or the edge to i. point: (m, dim) [m], the middle of the overlap. impulse: (m,) [N s]
-    along the normal in the last substep. Divided by the substep it is the force, except in the first substep of another length,
-    see Touches. Impulses of World.events() are sums over the frame. Particle i receives impulse * normal, particle j
-    -(1 - place) of that, and the end of the edge -place of that.
+    along the normal in the last substep. tangential: (m, dim) [N s], by friction; 0 for what bounces. Divided by the substep they
+    are forces, except in the first substep of another length, see Touches. Impulses of World.events() are sums over the frame.
+    Particle i receives impulse * normal + tangential, particle j -(1 - place) of that, and the end of the edge -place of that.
     """
 
     pairs: np.ndarray
@@ -40,6 +40,7 @@ class Contacts:
     normal: np.ndarray
     point: np.ndarray
     impulse: np.ndarray
+    tangential: np.ndarray
 
     def __len__(self) -> int:
         return len(self.pairs)
