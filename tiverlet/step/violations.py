@@ -69,7 +69,7 @@ class Bodies:
         strain, out, dim = np.zeros((2, self.count)), x.copy(), x.shape[1]  # sums over links, and their numbers
         for b, of in zip(self.batches, self.of, strict=True):
             if isinstance(b, Scalar) and b.arity == 2:
-                C = b.violation(x) * self.close[b] * (b.compliance == 0) * ~b.broken
+                C = b.violation(x) * self.close[b] * _holds(b) * ~b.broken
                 strain += [np.bincount(of, np.maximum(-C, 0), self.count), np.bincount(of, minlength=self.count)]
         strain = strain[0] / np.maximum(strain[1], 1)
         for k in np.flatnonzero(strain > SEEN):
@@ -118,7 +118,7 @@ class Bodies:
     def _share(self, b: Scalar, x: np.ndarray, borne: float, met: float) -> np.ndarray:
         """Return the same for the constraints of a batch, (m,)."""
         C, close = b.violation(x), self.close[b]
-        acts = (b.compliance == 0) & ~b.broken & ~b.immovable(self.scene.inv_mass) & (C * b.side >= 0)
+        acts = _holds(b) & ~b.broken & ~b.immovable(self.scene.inv_mass) & (C * b.side >= 0)
         C = np.where(acts, C, 0.0)
         if borne and (C != 0).any():
             C = C - borne * _borne(self.scene, b, x, C)
@@ -138,7 +138,7 @@ class Bodies:
         for b in self.batches:
             if _is_rigid(b):
                 C, W = b.violation(x), b.weights(x, split)
-                some = (b.compliance == 0) & ~b.broken & (C * b.side >= 0) & (W > 0) & (self.scene.slots.sag(b) == 0)
+                some = _holds(b) & ~b.broken & (C * b.side >= 0) & (W > 0) & (self.scene.slots.sag(b) == 0)
                 out += float((C[some] ** 2 / W[some]).sum())
         if self.solids.count:
             out += float((self.solids.m * self.solids.free * (self.solids.far(x) * self.solids.radius) ** 2).sum())
@@ -183,14 +183,14 @@ def left(batches: list[Batch], x: np.ndarray) -> list[tuple[Batch, np.ndarray]]:
     Constraints that are violated after settling contradict each other.
     """
     some = [b for b in _rigid(batches) if b.side == 0]
-    off = [(b, np.abs(b.violation(x) * b.inverse_size(x) * (b.compliance == 0) * ~b.broken)) for b in some]
+    off = [(b, np.abs(b.violation(x) * b.inverse_size(x) * _holds(b) * ~b.broken)) for b in some]
     return [(b, np.where(share > SEEN, share, 0.0)) for b, share in off]
 
 
 def first_off(features: list[Feature], x: np.ndarray) -> int | None:
     """Return the first particle of rigid constraints that are violated by more than SEEN at x, (n, dim); None without any."""
     rigid = _rigid([f for f in features if isinstance(f, Batch)])
-    return min((i for b in rigid for i in _off_corners(b, x, b.compliance == 0)), default=None)
+    return min((i for b in rigid for i in _off_corners(b, x, _holds(b))), default=None)
 
 
 def first_stiffened(features: Sequence[Feature], x: np.ndarray) -> int | None:
@@ -226,7 +226,13 @@ def _rigid(batches: list[Batch]) -> list[Scalar]:
 
 def _is_rigid(b: Batch) -> TypeGuard[Scalar]:
     """Whether a batch is one of numbers, some of which are rigid."""
-    return isinstance(b, Scalar) and bool((b.compliance == 0).any())
+    return isinstance(b, Scalar) and bool(_holds(b).any())
+
+
+def _holds(b: Scalar) -> np.ndarray:
+    """Return which constraints hold rigidly, (m,): neither springs, nor drives that give way beyond a largest load."""
+    out = b.compliance == 0
+    return out & np.isinf(b.course()[2]) if b.driven else out
 
 
 def tied(scene: Scene, batches: list[Batch], placed: int) -> np.ndarray:
