@@ -93,6 +93,9 @@ def test_arguments_of_particles_are_named_where_they_are_wrong(name, wrong):
         (scene(precision="f16"), ValueError, "precision = 'f16', but it must be one of 'f32'"),
         (scene(path="fast"), ValueError, "path = 'fast'"),
         (lambda: tv.World(np.zeros((3, 2))), TypeError, r"use tv.Particles\(position\)"),
+        (lambda: tv.World(tv.shapes.rope((0, 0), (1, 0), 5)), TypeError, r"is a Shape; write tv.Particles\(shape.position\)"),
+        (lambda: tv.Distance([[0, 1]], rest=1e30), ValueError, r"rest\[0\] = 1e\+30, but it must be at most 1e\+15"),
+        (lambda: tv.shapes.rope((0, 0), (1, 0), 5).turned(90), ValueError, r"write np.radians\(90\)"),
         (lambda: tv.Jacobi(relaxation=0), ValueError, "above 0"),
         (lambda: tv.init(arch="gpu"), ValueError, "arch = 'gpu', but it must be one of 'cpu'"),
         (lambda: tv.init(threads=0), ValueError, "threads = 0"),
@@ -160,6 +163,10 @@ def test_features_of_a_world_are_pickled_and_copied_without_it(world):
 
 def test_features_without_effect_are_warned_of(world):
     start = tv.Particles([[0.0, 0], [1, 0], [3.5, 0]])
+    with pytest.warns(UserWarning, match="friction = 30 is a coefficient. Of a slope of 30 degrees it is 0.58"):
+        tv.Contact(friction=30)
+    with pytest.warns(UserWarning, match="dt = 60 is a frame of 60 s. For 60 frames a second write dt=1/60"):
+        world(start, []).step(60)
     with pytest.warns(UserWarning, match="all radii are 0, so nothing touches"):
         world(start, [tv.Contact()])
     with pytest.warns(UserWarning, match=r"particle 2 starts 1.5 m outside along axis 0 \(1 such in all\); push_out brings"):

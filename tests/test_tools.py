@@ -15,6 +15,7 @@ def test_mix_clamp_smoothstep_and_approach():
     a, b = 0.1, 1e17 + 0.3
     assert tv.mix(a, b, 0) == a and tv.mix(a, b, 1) == b
     np.testing.assert_array_equal(tv.mix(np.array([1.0, 2.0]), np.array([3.0, 6.0]), 0.5), [2.0, 4.0])
+    np.testing.assert_array_equal(tv.mix((255, 0, 0), (0, 0, 255), 0.25), [191.25, 0, 63.75])
     np.testing.assert_array_equal(tv.clamp(np.array([-2.0, 0.5, 7.0]), 0.0, 1.0), [0.0, 0.5, 1.0])
     # t^2 (3 - 2 t): 0, 1/2 and 1 at the ends and the middle, level at both ends.
     np.testing.assert_allclose(tv.smoothstep(1.0, 3.0, np.array([0.0, 1.0, 2.0, 3.0, 9.0])), [0, 0, 0.5, 1, 1])
@@ -45,6 +46,7 @@ def test_golden_is_even_and_has_an_inverse():
     colors = tv.golden_colors(12)
     assert colors.shape == (12, 3) and colors.dtype == np.uint8 and len(np.unique(colors, axis=0)) == 12
     assert tv.golden_colors(0).shape == (0, 3)
+    np.testing.assert_array_equal(tv.golden_colors([7, 2]), colors[[7, 2]])
 
 
 @pytest.mark.parametrize("dim", [1, 2, 3, 5])

@@ -16,6 +16,7 @@ import numpy as np
 from .features.unknown_names import owners_of, suggest
 
 ANY = 2**31 - 1  # number of particles, while it is not yet known
+RATES = 24, 25, 30, 48, 50, 60, 72, 90, 100, 120, 144, 240  # [1/s] frames a second that are in use
 FEW = 16  # numbers that Python examines faster than NumPy, at most
 OF_SHAPE = {"position": "position", "pairs": "links", "triples": "bends", "quads": "quads", "loops": "loops"}  # by argument
 
@@ -55,6 +56,14 @@ def _real(who: str, name: str, value: Any) -> float:
     if array.ndim or array.dtype.kind not in "iuf":
         raise TypeError(f"{who}: {name} has shape {array.shape}, but one real number is needed.")
     return float(value)
+
+
+def frame_length(who: str, dt: Any) -> float:
+    """Return the length of a frame [s]. Warn where it is how many frames a second has."""
+    dt = number(who, "dt", dt, above=0.0)
+    if dt in RATES:
+        warn(f"{who}: dt = {dt:g} is a frame of {dt:g} s. For {dt:g} frames a second write dt=1/{dt:g}.")
+    return dt
 
 
 def flag(who: str, name: str, value: Any) -> bool:

@@ -44,12 +44,18 @@ def _both(kernel: Callable) -> Callable[[Callable], Callable]:
     return decorate
 
 
-@ti.pyfunc
+@ti.func
+def _mix_kernel(a, b, amount):
+    return a * (1 - amount) + b * amount
+
+
+@_both(_mix_kernel)
 def mix(a, b, amount):
-    """Interpolate linearly from a (amount 0) to b (amount 1); exact at both ends.
+    """Interpolate linearly from a (amount 0) to b (amount 1); exact at both ends. a, b: numbers, arrays or tuples.
 
     The article's formula is a (1 - amount) + b amount. The shorter a + (b - a) amount misses b by a rounding error.
     """
+    a, b = (np.asarray(v) if isinstance(v, (tuple, list)) else v for v in (a, b))
     return a * (1 - amount) + b * amount
 
 
@@ -143,8 +149,11 @@ def golden_index(value, dim: int = 1):
     return int(index) if index.ndim == 0 else index.astype(np.int64)
 
 
-def golden_colors(count: int, saturation: float = 0.62, value: float = 0.95) -> np.ndarray:
-    """Return `count` colours with hues at golden-ratio steps: (count, 3) uint8, red, green and blue."""
-    hues = golden(np.arange(checks.integer("golden_colors", "count", count, least=0)))
-    rgb = [colorsys.hsv_to_rgb(hue, saturation, value) for hue in np.atleast_1d(hues)]
-    return np.array(np.rint(np.array(rgb).reshape(count, 3) * 255), dtype=np.uint8)
+def golden_colors(count, saturation: float = 0.62, value: float = 0.95) -> np.ndarray:
+    """Return colours with hues at golden-ratio steps: uint8, red, green and blue.
+
+    count: how many, for (count, 3); or the numbers of some, such as [7], for (k, 3): a colour depends on its number alone.
+    """
+    some = np.arange(checks.integer("golden_colors", "count", count, least=0)) if np.ndim(count) == 0 else np.asarray(count)
+    rgb = [colorsys.hsv_to_rgb(hue, saturation, value) for hue in np.atleast_1d(golden(some.ravel()))] if some.size else []
+    return np.array(np.rint(np.array(rgb).reshape(*some.shape, 3) * 255), dtype=np.uint8)

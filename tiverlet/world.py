@@ -72,7 +72,9 @@ class World:
         solver: Solver | None = None, precision: str = "f32", path: str = "auto", order: int = 2,
     ):  # fmt: skip
         if not isinstance(particles, Particles):
-            raise TypeError(f"World: particles = {particles!r} is a {type(particles).__name__}; use tv.Particles(position).")
+            kind, ready = type(particles).__name__, hasattr(particles, "position")
+            write = "write tv.Particles(shape.position)" if ready else f"{particles!r}; use tv.Particles(position)"
+            raise TypeError(f"World: particles is a {kind}{'; ' if ready else ': '}{write}.")
         features = checked_features(features)
         starts = [None] * len(features)
         self._build(particles, features, starts, substeps, iterations, solver, precision, path, order)
@@ -152,7 +154,7 @@ class World:
         Other threads that read the world or its features wait for the end of the frame.
         """
         self._runner.memory.check()
-        dt = checks.number("World.step", "dt", dt, above=0.0)
+        dt = checks.frame_length("World.step", dt)
         with deferred_signals:
             for watcher in self._watchers:
                 watcher.before()
@@ -324,7 +326,7 @@ class World:
         for this run. progress: show a bar.
         """
         seconds = checks.number("World.run", "seconds", seconds, above=0.0)
-        dt = checks.number("World.run", "dt", dt, above=0.0)
+        dt = checks.frame_length("World.run", dt)
         frames: Any = range(max(1, round(seconds / dt)))
         if isinstance(recorder, (str, os.PathLike)):
             from .recording import Recorder

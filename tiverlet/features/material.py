@@ -14,6 +14,9 @@ if TYPE_CHECKING:
     from .feature import Scene
 
 
+DEGREES = 5.0  # a coefficient from here up to 90 is taken for an angle: no pair of materials has more than about 2
+
+
 class Coefficients(NamedTuple):
     """Coefficients of static and dynamic Coulomb friction, and of the resistance to rolling and to twisting, see Contact."""
 
@@ -41,6 +44,9 @@ def friction_of(who: str, name: str, value: Any) -> Coefficients:
     out = Coefficients(
         *(checks.number(who, f"{name} ({kind})", v, least=0.0) for kind, v in zip(Coefficients._fields, given, strict=False))
     )
+    if DEGREES <= out.static < 90:
+        mu = math.tan(math.radians(out.static))
+        checks.warn(f"{who}: {name} = {value!r} is a coefficient. Of a slope of {out.static:g} degrees it is {mu:.2g}.")
     if out.dynamic > out.static:
         raise ValueError(f"{who}: {name} = {value!r}: dynamic friction must not exceed static friction.")
     return out

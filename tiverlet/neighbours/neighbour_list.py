@@ -131,7 +131,7 @@ class NeighbourList:
         each = need * self.blocks / self.n
         if each > CROWDED:
             checks.warn(
-                f"Contact: up to {each:.0f} near pairs per particle, so steps cost as the square of their number. Particles "
+                f"World: up to {each:.0f} near pairs per particle, so steps cost as the square of their number. Particles "
                 "overlap each other, or one is much larger than the rest."
             )
         return self.allocate(int(need * 1.25 + 16) * self.blocks)

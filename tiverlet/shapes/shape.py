@@ -67,6 +67,8 @@ class Shape:
     def turned(self, angle: float, about=None, axis=(0.0, 0.0, 1.0)) -> "Shape":
         """Return the body, turned by an angle [rad] about a point (None: its mean); in 3D around an axis."""
         angle, dim = checks.number("turned", "angle", angle), self.position.shape[1]
+        if abs(angle) > 2 * np.pi:
+            raise ValueError(f"turned: angle = {angle:g} rad is more than a turn. For degrees write np.radians({angle:g}).")
         center = self.position.mean(axis=0) if about is None else checks.vector("turned", "about", about, dim)
         c, s = np.cos(angle), np.sin(angle)
         if dim == 2:

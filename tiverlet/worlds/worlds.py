@@ -141,7 +141,7 @@ class Worlds:
 
     def step(self, dt: float) -> WorldsReport:
         """Advance all worlds by dt [s], see World.step()."""
-        return self._frames(1, checks.number("Worlds.step", "dt", dt, above=0.0))
+        return self._frames(1, checks.frame_length("Worlds.step", dt))
 
     def run(self, seconds: float, dt: float = 1 / 60, progress: bool = False) -> WorldsReport:
         """Step all worlds for `seconds` [s], rounded to whole frames of dt [s], with many frames per launch.
@@ -792,4 +792,4 @@ def _checked(worlds: Any, count: int | None) -> list[World]:
 
 def _frame_count(who: str, seconds: float, dt: float) -> int:
     seconds = checks.number(who, "seconds", seconds, above=0.0)
-    return max(1, round(seconds / checks.number(who, "dt", dt, above=0.0)))
+    return max(1, round(seconds / checks.frame_length(who, dt)))

@@ -7,6 +7,7 @@ import numpy as np
 from ...device import ti
 from ...features.feature import Knob
 from ...features.items import Items
+from ...particles import LARGEST
 from .quantity import Quantity, exact_rest
 
 if TYPE_CHECKING:
@@ -19,7 +20,7 @@ def refuse_long(batch: Any, length: np.ndarray) -> None:
         batch.periodic.refuse(repr(batch), f"link {int(length.argmax())} holds particles", float(length.max()), "links", True)
 
 
-REST_LENGTH = Knob(Items(None, refuse_long, least=0.0), "Rest length [m].")
+REST_LENGTH = Knob(Items(None, refuse_long, least=0.0, most=LARGEST), "Rest length [m].")
 
 
 class Length(Quantity):
