@@ -145,7 +145,9 @@ def golden_index(value, dim: int = 1):
         array = array[..., 0]
     if not ((array >= 0) & (array < 1)).all():
         raise ValueError("golden_index: values must be at least 0 and below 1.")
-    index = (np.rint(array * 2.0**BITS).astype(np.uint64) * np.uint64(_golden_inverse(dim))) & np.uint64(2**BITS - 1)
+    turned = np.rint(array * 2.0**BITS).astype(np.uint64)
+    with np.errstate(over="ignore"):  # modulo 2**64
+        index = (turned * np.uint64(_golden_inverse(dim))) & np.uint64(2**BITS - 1)
     return int(index) if index.ndim == 0 else index.astype(np.int64)
 
 
