@@ -165,21 +165,23 @@ def test_friction_holds_far_from_the_origin(world, what):
 
 def test_scenes_take_as_many_substeps_as_they_need(world):
     # 4 where particles and rigid bodies fall freely between contacts. Links, clusters that share particles or give way, and
-    # forces that change take 20, and so does what has no contacts.
+    # forces that change take 20, and so does what has no contacts. A hand changes nothing.
     squares, loops = np.concatenate([block(1, 1, 0), block(1, 1, (2, 0))]), [[0, 1, 2, 3], [4, 5, 6, 7]]
     for few, *features in (
-        (True,), (True, tv.Drag(0.1)), (False, tv.Attractor((0, 0), 1.0)), (True, tv.ShapeMatch(loops)),
+        (True,), (True, tv.Drag(0.1)), (True, tv.Hand((0, 0))), (False, tv.Attractor((0, 0), 1.0)), (True, tv.ShapeMatch(loops)),
         (True, tv.ShapeMatch(loops[:1]), tv.ShapeMatch(loops[1:])),
         (False, tv.ShapeMatch(loops), tv.ShapeMatch([[0, 4]])), (False, tv.ShapeMatch(loops, compliance=1e-4)),
         (False, tv.ShapeMatch(loops), tv.Distance([(0, 4)])), (False, tv.ShapeMatch(loops), tv.Attractor((0, 0), 1.0)),
     ):  # fmt: skip
         w = world(tv.Particles(squares, radius=0.1), [tv.Gravity(), tv.Contact(), *features])
         assert w.substeps == (4 if few else 20), features
+        assert f"(by default, for {'contacts' if few else 'constraints'}" in w.explain()
     assert world(tv.Particles(squares), [tv.Gravity()]).substeps == 20
     link, w = tv.Distance([[0, 4]]), world(tv.Particles(squares, radius=0.1), [tv.Gravity(), tv.Contact()])
     w.add(features=[link])
     assert w.substeps == 20
     w.substeps = 7
+    assert "by default" not in w.explain()
     w.remove(features=[link])
     assert w.substeps == 7
     w.substeps = None

@@ -231,6 +231,7 @@ class Acceleration(Feature):
     conservative: potential() is defined, so the energy report can account for it.
     decays: it has a rate, a linear drag [1/s] that is solved exactly (exponential); several rates add up.
     pairwise: it acts between particles, and is evaluated for all particles before any of them moves, see PairForce.
+    is_tool: it is there for the user's hand, and frames have no more substeps for it by default.
     """
 
     accelerates = True
@@ -243,6 +244,7 @@ class Acceleration(Feature):
     decays = False
     rate = 0.0
     pairwise = False
+    is_tool = False
     neighbours_per_particle = 0  # initial room for listed neighbours, per particle
     dim = 0  # of the world; 0 before it is in one
 

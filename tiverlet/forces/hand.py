@@ -44,6 +44,7 @@ class Hand(Acceleration):
     is_fixed_in_space = False
     uses_velocity = True
     conservative = True
+    is_tool = True
     particle = Knob(_particle, "The particle that is drawn; -1: none.")
     target = Knob(_target, "Where it is drawn to [m].", place=shifted)
     rate = Knob(lambda f, v: checks.number("Hand", "rate", v, least=0.0), "How fast it gets there [1/s].")

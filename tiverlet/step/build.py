@@ -247,7 +247,8 @@ def usual_substeps(features: tuple[Feature, ...]) -> int:
     """Return how many substeps frames have where the user does not say."""
     rows = any(isinstance(f, PairContact) for f in features)
     bodies = _are_separate_bodies([f for f in features if isinstance(f, Batch) and not f.is_kinematic])
-    free = all((f.common and f.steady) or not f.accelerates for f in features if isinstance(f, Acceleration))
+    forces = [f for f in features if isinstance(f, Acceleration) and not f.is_tool]
+    free = all((f.common and f.steady) or not f.accelerates for f in forces)
     return GRAINS if rows and free and bodies else USUAL
 
 

@@ -16,6 +16,7 @@ from ..neighbours.neighbour_search import NeighbourSearch
 from ..neighbours.periodic import Periodic
 from ..shapes.shape import morton
 from ..solvers.choice import explain_choice
+from .build import GRAINS
 from .energy_bound import springs
 from .sleep import Sleep
 
@@ -28,14 +29,23 @@ PERIOD = 16  # substeps in a period of a spring that see cos(pi / 16) = 0.98 of 
 FLAT = 1e-6  # 1 - cos(slope), up to which a floor is level: a twelfth of a degree
 
 
+def _default(world: "World") -> str:
+    """Return why there are so many substeps, if the user has not said how many."""
+    if world._controller.auto or world._substeps:
+        return ""
+    few = world._usual_substeps == GRAINS
+    return f" (by default, for {'contacts between free falls' if few else 'constraints, or forces that change'})"
+
+
 def explain(world: "World") -> str:
     """Return a text of a few lines about particles, features, parts that were left out, launches and memory."""
     p, step = world.particles, world._runner.step
     lines = [
         f"{len(p)} particles in {p.dim}D, {int((p.inv_mass == 0).sum())} static; {world.precision} on "
         f"{runtime.architecture()}, {runtime.threads()} threads",
-        f"{'auto, now ' * world._controller.auto}{world.substeps} substeps x {world.iterations} iterations, path {world.path}: "
-        f"{_launches(world)}" + (f"; order {world.order}, {step.integrator.stages} stages in a substep" * (world.order > 2)),
+        f"{'auto, now ' * world._controller.auto}{world.substeps} substeps x {world.iterations} iterations{_default(world)}, "
+        f"path {world.path}: {_launches(world)}"
+        + (f"; order {world.order}, {step.integrator.stages} stages in a substep" * (world.order > 2)),
         "In the kernels:",
         *(f"    {line}" for line in _present(world)),
         "Left out, at no cost:",
