@@ -16,7 +16,7 @@ import numpy as np
 from .features.unknown_names import owners_of, suggest
 
 ANY = 2**31 - 1  # number of particles, while it is not yet known
-RATES = 24, 25, 30, 48, 50, 60, 72, 90, 100, 120, 144, 240  # [1/s] frames a second that are in use
+RATES = 24, 30, 60, 120, 144, 240  # [1/s] frames a second that are in use
 FEW = 16  # numbers that Python examines faster than NumPy, at most
 OF_SHAPE = {"position": "position", "pairs": "links", "triples": "bends", "quads": "quads", "loops": "loops"}  # by argument
 
