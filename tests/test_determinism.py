@@ -97,7 +97,8 @@ def test_explain_names_what_is_in_and_what_is_out(world):
     )
     text = w.explain()
     for part in (
-        "3 particles in 2D, 2 static; f32 on cpu", "20 substeps x 3 iterations (by default, for constraints, or", "path fused: 1 launch per frame",
+        "3 particles in 2D, 2 static; f32 on cpu", "20 substeps x 3 iterations (by default, for constraints, or",
+        "path fused: 1 launch per frame",
         "Distance: 2 constraints, 1 of them between particles that cannot move", "grid, neighbour list, contacts: no Contact",
         "every constraint is rigid", "breaks counted: no constraint has break_at", "Constraint corners that can move: 1 of 4",
     ):  # fmt: skip
