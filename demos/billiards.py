@@ -30,7 +30,7 @@ def build() -> tv.World:
     felt = tv.HalfSpace((0, 0, 1), friction=(SLIDING, SLIDING, ROLLING, 0.02), restitution=0.5)
     cushions = tv.Box((0, -WIDTH / 2, -0.1), (LENGTH, WIDTH / 2, 0.1), friction=0.14, restitution=0.75)
     balls = tv.Particles(x, velocity=velocity, mass=MASS, radius=RADIUS, spin=spin, orientation=0)
-    return tv.World(balls, [tv.Gravity((0, 0, -9.81)), tv.Contact(friction=0.06, restitution=0.95), felt, cushions])
+    return tv.World(balls, [tv.Gravity((0, 0, -9.81)), tv.Contact(friction=0.06, restitution=0.95), felt, cushions], substeps=8)
 
 
 def check(world: tv.World) -> None:
