@@ -115,6 +115,8 @@ def test_what_moves_presses_by_its_fluctuations(world):
     assert np.abs(tv.measure.stress(w).total).max() < 1e-12 and tv.measure.granular_temperature(w) < 1e-12
     with pytest.raises(ValueError, match="no volume"):
         tv.measure.stress(world(tv.Particles(x), []))
+    with pytest.raises(ValueError, match="bodies of Polygons touch with their edges"):
+        tv.measure.stress(world(tv.Particles([(0, 0), (1, 0), (0, 1)]), [tv.Polygons([[0, 1, 2]]), tv.ShapeMatch([[0, 1, 2]])]))
     with pytest.raises(ValueError, match="sheared box moves"):
         tv.measure.stress(w, [(0, 0, 0), (1, 1, 1)])
 

@@ -5,6 +5,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
+from .contact import Polygons
 from .features.unknown_names import no_name
 from .geometry.intervals import cross_2d
 from .neighbours.queries import between
@@ -104,9 +105,11 @@ def stress(world: "World", region=None) -> Stress:
     are no part of it.
 
     region: (lower, upper) corners of a box [m]; None for all of a box that is periodic along all axes. Raises ValueError without
-    a volume, and for a region in a sheared box.
+    a volume, for a region in a sheared box, and beside Polygons.
     """
     box, x = world._runner.scene.periodic, world.position
+    if any(isinstance(f, Polygons) for f in world.features):
+        raise ValueError("measure.stress: bodies of Polygons touch with their edges. Sum up world.contacts over pairs of bodies.")
     whole = box if region is None and box is not None and np.isfinite(box.lengths).all() else None
     if not whole and (region is None or (box is not None and box.sheared)):
         why = "the world has no volume" if region is None else "a region of a sheared box moves"
@@ -129,7 +132,7 @@ def stress(world: "World", region=None) -> Stress:
 
 def _fluctuations(world: "World", some: Any) -> np.ndarray:
     """Return velocities of some particles about their mean, and about the profile of a sheared box, (k, dim) [m/s]."""
-    box, m, v = world._runner.scene.periodic, _mass(world)[some], world.velocity[some]
+    box, m, v = world._runner.scene.periodic, _mass(world)[some], np.array(world.velocity[some])
     if box is not None:
         v[:, 0] -= box.shear * world.position[some, 1]
     return v - m @ v / (m.sum() or 1.0)
