@@ -14,7 +14,7 @@ if TYPE_CHECKING:
     from .feature import Scene
 
 
-DEGREES = 5.0  # a coefficient from here up to 90 is taken for an angle: no pair of materials has more than about 2
+DEGREES = 10.0  # a coefficient from here up to 90 is taken for an angle: no pair of materials has more than about 2
 
 
 class Coefficients(NamedTuple):
